@@ -1,0 +1,1 @@
+"""Close-range 3-D position sensing with two or more ordinary cameras placed anywhere."""

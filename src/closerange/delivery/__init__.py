@@ -1,0 +1,1 @@
+"""Results leave: reports, figures, tables."""

@@ -1,0 +1,1 @@
+"""Pixels become points: targets, thresholds, borders, disc centres, labels."""

@@ -1,0 +1,1 @@
+"""Mathematics that knows no camera: frozen arrays, rigid transforms, rays, covariances."""

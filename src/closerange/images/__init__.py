@@ -1,0 +1,1 @@
+"""Where pixels enter: frames, decoders with limits, folders of images."""

@@ -1,0 +1,1 @@
+"""Image points of several cameras become world points, with covariance."""

@@ -1,0 +1,1 @@
+"""Cameras calibrated to one world frame: models, solutions, the rig and its file."""

@@ -1,0 +1,1 @@
+"""The verbs: detect, calibrate, measure, verify, run, demo, report."""
