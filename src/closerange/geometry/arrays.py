@@ -56,3 +56,21 @@ def _checked(array: NDArray[Any], shape: tuple[int | None, ...], name: str) -> N
         raise ValueError(f"{name} has shape {array.shape}, expected {wanted}")
     array.flags.writeable = False
     return array
+
+
+def all_finite(array: FloatArray, axis: int | tuple[int, ...]) -> BoolArray:
+    """Return where all numbers along some axes are finite.
+
+    Parameters
+    ----------
+    array : ndarray
+        Any numbers.
+    axis : int or tuple of int
+        Axes that are reduced.
+
+    Returns
+    -------
+    ndarray of bool
+        One value for each remaining index.
+    """
+    return np.asarray(np.isfinite(array).all(axis=axis))

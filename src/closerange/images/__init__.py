@@ -1,1 +1,52 @@
-"""Where pixels enter: frames, decoders with limits, folders of images."""
+"""Where pixels enter: frames, decoders with limits, folders of images.
+
+A file becomes a `Frame` only if it is whole, of a known format, within stated limits, and if
+every grey value survives: the header is read and checked before OpenCV decodes a pixel, and
+what OpenCV returns is compared with it. Nothing is turned, stretched or cut to 8 bits. Images
+taken together form an `ImageSet`; sets are checked for orphans, duplicates, sizes and times,
+and single frames for being blank or interlaced.
+"""
+
+from closerange.images.checks import (
+    check_frame,
+    comb_share,
+    noise_level,
+    saturated_share,
+    structure_range,
+)
+from closerange.images.decode import MAX_IMAGE_BYTES, MAX_PIXELS, read_image
+from closerange.images.folder import list_images, natural_key
+from closerange.images.frame import Frame
+from closerange.images.headers import ImageHeader, read_header
+from closerange.images.image_sets import (
+    ImageSet,
+    check_duplicates,
+    check_simultaneous,
+    check_sizes,
+    group_images,
+    placement_and_reading,
+    placement_name,
+)
+
+__all__ = [
+    "MAX_IMAGE_BYTES",
+    "MAX_PIXELS",
+    "Frame",
+    "ImageHeader",
+    "ImageSet",
+    "check_duplicates",
+    "check_frame",
+    "check_simultaneous",
+    "check_sizes",
+    "comb_share",
+    "group_images",
+    "list_images",
+    "natural_key",
+    "noise_level",
+    "placement_and_reading",
+    "placement_name",
+    "read_header",
+    "read_image",
+    "saturated_share",
+    "structure_range",
+]

@@ -1,1 +1,1 @@
-"""Comparison with a known truth: synthetic scenes, predicted error, acceptance tests."""
+"""Comparison with a known truth: synthetic scenes, bounds, acceptance tests."""

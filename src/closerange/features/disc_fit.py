@@ -1,0 +1,318 @@
+"""Grey-level least-squares fit of one disc: its image ellipse and edge blur."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+from scipy.special import ndtr
+
+from closerange.geometry.arrays import BoolArray, FloatArray
+from closerange.geometry.ellipse import Ellipse, axes_of_shape, distance_terms
+from closerange.geometry.least_squares import LeastSquaresFit, levenberg_marquardt
+
+# Half-width of the fitted band: within 3 sigma of blur the edge is complete to 0.1 % of the
+# contrast; 1.5 px more of flat grey on either side fix the two levels.
+BAND_BLURS, BAND_FLAT_PX = 3.0, 1.5
+# A pixel next to another feature is left out where that feature's own blur reaches it.
+NEIGHBOUR_BLURS = 2.0
+# Blur of a lens in focus, pixel box included (1/12 px^2), and how far it may be off: a factor 2
+# is one sigma. A thousand pixels overrule it; on a disc of a dozen pixels, where blur, size and
+# contrast are exchangeable, it decides.
+USUAL_BLUR_PX, BLUR_LOG_STD = 0.8, float(np.log(2.0))
+# Below this radius (blurs) the interior has no flat middle that could show a slope of its own.
+SLOPE_RADIUS_BLURS = 6.0
+# Rounding to whole grey values: uniform over one of them.
+QUANTISATION_DN2 = 1 / 12
+# Share of the edge profile below which a pixel is flat, and how many flat pixels give a variance
+# of their own (to a quarter of its value).
+FLAT_SHARE, FLAT_PIXELS = 0.03, 30
+# A blur beyond 0.02 .. 50 px is not what this model describes.
+LARGEST_LOG_BLUR = 4.0
+MAX_PASSES = 4
+MAX_ITERATIONS = 40
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class DiscFit:
+    """What the fit of one disc found.
+
+    Attributes
+    ----------
+    xy_px : ndarray, shape (2,)
+        Centre of the image ellipse.
+    cov_px2 : ndarray, shape (2, 2)
+        Its covariance, scaled by the fit's own residuals.
+    ellipse : tuple of float
+        Semi-axes a >= b in px, angle of the major axis from +x towards +y in rad.
+    blur_px : float
+        Standard deviation of the Gaussian edge blur, the pixel's own width included.
+    contrast : float
+        Grey value inside minus outside; negative for a dark disc.
+    noise : float
+        Standard deviation of a pixel, root mean square of inside and outside.
+    reduced_residual : float
+        Residual across the edge, divided by the noise; near 1 where the model holds.
+    converged : bool
+        Whether the last pass reached its minimum.
+    """
+
+    xy_px: FloatArray
+    cov_px2: FloatArray
+    ellipse: tuple[float, float, float]
+    blur_px: float
+    contrast: float
+    noise: float
+    reduced_residual: float
+    converged: bool
+
+
+def fit_disc(
+    pixels: NDArray[Any],
+    start: Ellipse,
+    *,
+    full_scale: float = np.inf,
+    other: BoolArray | None = None,
+    blur_px: float = USUAL_BLUR_PX,
+) -> DiscFit:
+    """Fit the grey values of a disc with a blurred ellipse.
+
+    Parameters
+    ----------
+    pixels : ndarray, shape (H, W)
+        Grey values.
+    start : Ellipse
+        Approximate outline in px, good to about a pixel.
+    full_scale : float, optional
+        Grey value at which the sensor clips.
+    other : ndarray of bool, shape (H, W), optional
+        Pixels of other features: the band stays away from them by their blur, but never by
+        more than half of the gap.
+    blur_px : float, optional
+        First guess of the blur.
+
+    Returns
+    -------
+    DiscFit
+        All values NaN and `converged` False if there are not enough pixels.
+
+    Notes
+    -----
+    Model: ``background plane + contrast * Phi(-d / blur)`` with the signed distance d of
+    `Ellipse.signed_distance`; large discs have a contrast with slopes of its own, for light
+    that varies across them. Clipping is modelled as the sensor does it: a pixel's expected
+    value is that of min(value + noise, full scale), so that clipped pixels neither pull nor
+    bias, and they do not count in the residual variance. Weights come from the variances that
+    the previous pass left inside and outside (shot noise differs); quantisation is their floor.
+    """
+    crop = _Crop.around(pixels, start, other)
+    x = _start_vector(start, blur_px)
+    variances = None
+    for _ in range(MAX_PASSES):
+        band = crop.band(x, variances, full_scale)
+        if band is None:
+            return NOT_MEASURED
+        if variances is None:
+            x[BACKGROUND], x[CONTRAST] = band.levels()
+        free = x if _shortest_px(x) > SLOPE_RADIUS_BLURS * np.exp(x[BLUR]) else x[:CONTRAST_SLOPES]
+        fit = levenberg_marquardt(band.residuals, free, max_iterations=MAX_ITERATIONS)
+        if not np.isfinite(fit.cost):
+            return NOT_MEASURED
+        settled = variances is not None and not _moved(x, fit.x)
+        x = np.append(fit.x, np.zeros(x.size - fit.x.size))
+        variances = band.variances_after(fit)
+        if settled:  # with weights from residuals, on the band where the disc really is
+            break
+    return _result(fit, band, crop.origin)
+
+
+# Parameters: centre x, y and shape xx, xy, yy as in `distance_terms`; logarithm of the blur;
+# background with two slopes; contrast with two slopes. Positions count from the start's centre.
+BLUR, BACKGROUND, CONTRAST, CONTRAST_SLOPES = 5, 6, 9, 10
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Crop:
+    """The surroundings of a disc, wide enough for any band that makes sense."""
+
+    origin: FloatArray
+    xy: FloatArray
+    values: FloatArray
+    to_other: FloatArray
+
+    @classmethod
+    def around(cls, pixels: NDArray[Any], start: Ellipse, other: BoolArray | None) -> _Crop:
+        """Cut out the disc and as much again around it, eight pixels at least."""
+        a, _, _ = start.axes
+        reach = a + max(a, 8.0)
+        first = np.maximum(np.floor(start.centre - reach), 0).astype(int)
+        last = np.maximum(np.ceil(start.centre + reach) + 1, first).astype(int)
+        window = (slice(first[1], last[1]), slice(first[0], last[0]))
+        values = pixels[window].astype(np.float64)
+        rows, columns = np.indices(values.shape)
+        xy = np.stack([columns + first[0], rows + first[1]], axis=-1) - start.centre
+        if other is None or not other[window].any():
+            to_other = np.full(values.size, np.inf)
+        else:
+            free = (~other[window]).astype(np.uint8)
+            distances = cv2.distanceTransform(free, cv2.DIST_L2, cv2.DIST_MASK_5)
+            to_other = distances.astype(np.float64).ravel()
+        return cls(np.asarray(start.centre), xy.reshape(-1, 2), values.ravel(), to_other)
+
+    def band(
+        self, x: FloatArray, variances: tuple[float, float] | None, full_scale: float
+    ) -> _Band | None:
+        """Choose the pixels along the edge; None if they cannot carry the parameters."""
+        distance = distance_terms(x[:5], self.xy)[0]
+        blur = float(np.exp(x[BLUR]))
+        at_edge = np.abs(distance) < 1
+        gap = float(self.to_other[at_edge].min()) if at_edge.any() else 0.0
+        chosen = np.abs(distance) <= BAND_BLURS * blur + BAND_FLAT_PX
+        chosen &= self.to_other > min(NEIGHBOUR_BLURS * blur, gap / 2)
+        if np.count_nonzero(chosen) <= x.size:
+            return None
+        xy, values, distance = self.xy[chosen], self.values[chosen], distance[chosen]
+        inside = ndtr(-distance / blur)
+        if variances is None:
+            variances = _spread(values[inside < 0.5]), _spread(values[inside >= 0.5])
+        variance = variances[0] + (variances[1] - variances[0]) * inside
+        clips = bool((values >= full_scale).any())
+        return _Band(xy, values, inside, np.sqrt(variance), full_scale if clips else np.inf)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Band:
+    """Pixels of one pass, with the share of the disc in each and their standard deviations."""
+
+    xy: FloatArray
+    values: FloatArray
+    inside: FloatArray
+    std: FloatArray
+    full_scale: float
+
+    def levels(self) -> tuple[float, float]:
+        """Guess background and contrast from the pixels that are most outside and inside."""
+        low, high = np.quantile(self.inside, (0.25, 0.75))
+        background = float(np.median(self.values[self.inside <= low]))
+        return background, float(np.median(self.values[self.inside >= high])) - background
+
+    def residuals(self, x: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Weighted residuals and Jacobian; the last row is the usual blur."""
+        model, jacobian = _grey_values(x, self.xy)
+        if np.isfinite(self.full_scale):
+            # E[min(value + noise, full scale)] and its slope
+            excess = (model - self.full_scale) / self.std
+            unclipped = ndtr(-excess)
+            model = model - self.std * (excess * (1 - unclipped) + _density(excess))
+            jacobian = jacobian * unclipped[:, None]
+        blur_row = np.zeros(x.size)
+        blur_row[BLUR] = 1 / BLUR_LOG_STD
+        usual = (x[BLUR] - np.log(USUAL_BLUR_PX)) / BLUR_LOG_STD
+        return (
+            np.append((model - self.values) / self.std, usual),
+            np.vstack([jacobian / self.std[:, None], blur_row]),
+        )
+
+    def counted(self, fit: LeastSquaresFit) -> tuple[BoolArray, float]:
+        """Return which pixels tell about noise, and the factor for the fitted parameters."""
+        model = _grey_values(fit.x, self.xy)[0]
+        kept = model < self.full_scale - 2 * self.std
+        number = int(np.count_nonzero(kept))
+        return kept, number / max(number + 1 - fit.x.size, 1)
+
+    def variances_after(self, fit: LeastSquaresFit) -> tuple[float, float]:
+        """Grey-value variance outside and inside, from the residuals where the disc is flat."""
+        kept, factor = self.counted(fit)
+        squares = factor * (fit.residuals[:-1] * self.std) ** 2
+        pooled = squares[kept].mean() if kept.any() else 0.0
+        found = []
+        for flat in (self.inside < FLAT_SHARE, self.inside > 1 - FLAT_SHARE):
+            chosen = squares[flat & kept]
+            found.append(chosen.mean() if chosen.size >= FLAT_PIXELS else pooled)
+        return max(found[0], QUANTISATION_DN2), max(found[1], QUANTISATION_DN2)
+
+
+def _grey_values(x: FloatArray, xy: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Model grey values (n,) and their Jacobian (n, p); NaN outside the model's domain."""
+    if not abs(x[BLUR]) < LARGEST_LOG_BLUR:
+        return np.full(len(xy), np.nan), np.full((len(xy), x.size), np.nan)
+    distance, by_centre, by_shape, _ = distance_terms(x[:5], xy)
+    blur = np.exp(x[BLUR])
+    t = distance / blur
+    inside, density = ndtr(-t), _density(t)
+    terms = np.column_stack([np.ones(len(xy)), xy])
+    background = terms @ x[BACKGROUND:CONTRAST]
+    contrast_terms = terms[:, : x.size - CONTRAST]
+    contrast = contrast_terms @ x[CONTRAST:]
+    by_distance = (-contrast * density / blur)[:, None]
+    jacobian = np.hstack(
+        [
+            by_distance * by_centre,
+            by_distance * by_shape,
+            (contrast * density * t)[:, None],
+            terms,
+            contrast_terms * inside[:, None],
+        ]
+    )
+    return background + contrast * inside, jacobian
+
+
+def _density(t: FloatArray) -> FloatArray:
+    return np.asarray(np.exp(-0.5 * t * t) / np.sqrt(2 * np.pi))
+
+
+def _spread(values: FloatArray) -> float:
+    """Robust variance of one side, quantisation at least: a weight for the first pass only."""
+    if values.size == 0:
+        return 1.0
+    deviation = float(np.median(np.abs(values - np.median(values))))
+    return max((1.4826 * deviation) ** 2, QUANTISATION_DN2)
+
+
+def _start_vector(start: Ellipse, blur_px: float) -> FloatArray:
+    (xx, xy), (_, yy) = start.shape
+    return np.array([0, 0, xx, xy, yy, np.log(blur_px), 0, 0, 0, 0, 0, 0], dtype=np.float64)
+
+
+def _moved(before: FloatArray, after: FloatArray) -> bool:
+    """Whether the band of `before` was misplaced by half a pixel, or its width by 15 %."""
+    size = [np.array(axes_of_shape(*x[2:5])[:2]) for x in (before, after)]
+    shifts = np.append(after[:2] - before[:2], size[1] - size[0])
+    return bool((np.abs(shifts) > 0.5).any() or abs(after[BLUR] - before[BLUR]) > 0.15)
+
+
+def _shortest_px(x: FloatArray) -> float:
+    return axes_of_shape(*x[2:5])[1]
+
+
+def _result(fit: LeastSquaresFit, band: _Band, origin: FloatArray) -> DiscFit:
+    """Turn the last pass into named results."""
+    kept, factor = band.counted(fit)
+    squares = fit.residuals[:-1][kept] ** 2
+    edge = np.abs(band.inside[kept] - 0.5) < 0.5 - FLAT_SHARE
+    variances = band.variances_after(fit)
+    # The weights' variances were floored by quantisation; the residuals may not undercut it.
+    reduced = max(
+        factor * float(squares.mean()) if squares.size else 1.0,
+        QUANTISATION_DN2 / min(variances),
+    )
+    return DiscFit(
+        xy_px=origin + fit.x[:2],
+        cov_px2=fit.covariance(reduced)[:2, :2],
+        ellipse=axes_of_shape(*fit.x[2:5]),
+        blur_px=float(np.exp(fit.x[BLUR])),
+        contrast=float(fit.x[CONTRAST]),
+        noise=float(np.sqrt(np.mean(variances))),
+        reduced_residual=float(np.sqrt(factor * squares[edge].mean())) if edge.any() else 1.0,
+        converged=fit.converged,
+    )
+
+
+_NAN2 = np.full(2, np.nan)
+NOT_MEASURED = DiscFit(
+    _NAN2, np.full((2, 2), np.nan), (np.nan,) * 3, np.nan, np.nan, np.nan, np.nan, converged=False
+)
+"""The answer where there is nothing to fit."""

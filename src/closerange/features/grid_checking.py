@@ -1,0 +1,292 @@
+"""Checking a grown lattice: is each disc where, and as large as, its neighbours say?
+
+The neighbours up to two places away fix a local homography, which holds perspective exactly
+and lens distortion to the third order of the pitch. It predicts place and size of the disc in
+their middle without using that disc.
+"""
+
+from __future__ import annotations
+
+from itertools import product
+
+import numpy as np
+
+from closerange.errors import DetectionError
+from closerange.features.grid_growing import Candidates, Node, Nodes, expected_radius
+from closerange.features.target import DiscGrid
+from closerange.geometry.arrays import FloatArray
+
+PLACE_TOLERANCE = 0.25
+"""Largest distance of a disc from its predicted place, in pitches. Centres are measured to
+0.01 pitches; the room is for extrapolation to the rim of a grid of few, widely spaced discs
+in a wide-angle image (0.2 pitches for 3 x 3 discs filling a 60 degree view at 14 % barrel)."""
+
+SIZE_TOLERANCE = 1.3
+"""Largest factor between measured and predicted diameter. Blur and threshold change small
+discs by up to 10 %, a wide lens by up to 15 % towards the corners."""
+
+REACH = 2
+MIN_NEIGHBOURS = 6
+"""A homography needs 4; two more make its prediction a check."""
+
+
+def clean(nodes: Nodes, candidates: Candidates, grid: DiscGrid) -> Nodes:
+    """Take out what does not fit its neighbours, then fill the gaps that the rest predicts.
+
+    Parameters
+    ----------
+    nodes : dict of (int, int) to int
+        A grown lattice.
+    candidates : Candidates
+        M discs.
+    grid : DiscGrid
+        Pitch and diameters.
+
+    Returns
+    -------
+    dict of (int, int) to int
+        Empty if the sizes contradict the target altogether.
+
+    Raises
+    ------
+    DetectionError
+        If two candidates claim one place.
+    """
+    nodes = _pruned(nodes, candidates, grid)
+    while True:
+        added = _fill(nodes, candidates, grid)
+        if not added:
+            break
+        nodes |= added
+    return _with_best_claims(_pruned(nodes, candidates, grid), candidates, grid)
+
+
+def size_ratios(nodes: Nodes, candidates: Candidates, grid: DiscGrid) -> FloatArray:
+    """Return measured over predicted ordinary diameter of each node; NaN where unknown.
+
+    Parameters
+    ----------
+    nodes : dict of (int, int) to int
+        A lattice of n discs.
+    candidates : Candidates
+        M discs.
+    grid : DiscGrid
+        Pitch and diameter.
+
+    Returns
+    -------
+    ndarray, shape (n,)
+        In the order of `nodes`. About 1 for an ordinary disc.
+    """
+    ratios = np.full(len(nodes), np.nan)
+    for row, (node, index) in enumerate(nodes.items()):
+        local = _local_map(node, nodes, candidates)
+        if local is None:
+            local = _local_map(node, nodes, candidates, least=4, with_itself=True)
+        if local is not None:
+            ratios[row] = _size_ratio(index, local[1], candidates, grid)
+    return ratios
+
+
+def plane_homography(places: FloatArray, xy_px: FloatArray) -> FloatArray | None:
+    """Fit the homography from lattice places to image points by the normalised DLT.
+
+    Parameters
+    ----------
+    places : ndarray, shape (n, 2)
+        Places in the lattice, n >= 4.
+    xy_px : ndarray, shape (n, 2)
+        Image points, px.
+
+    Returns
+    -------
+    ndarray, shape (3, 3), or None
+        None where the places do not fix it (all but one on a line).
+
+    Notes
+    -----
+    Hartley & Zisserman, Multiple View Geometry, 2nd ed., algorithm 4.2.
+    """
+    scaled, t_places = _normalised(places)
+    points, t_points = _normalised(xy_px)
+    if scaled is None or points is None:
+        return None
+    x, y = points.T
+    ones = np.column_stack([scaled, np.ones(len(scaled))])
+    zeros = np.zeros_like(ones)
+    design = np.vstack(
+        [
+            np.hstack([ones, zeros, -x[:, None] * ones]),
+            np.hstack([zeros, ones, -y[:, None] * ones]),
+        ]
+    )
+    # of the 9 x 9 normal matrix; a full 2n x 2n basis would be wasted
+    values, vectors = np.linalg.eigh(design.T @ design)
+    if values[1] < 1e-6 * values[-1]:  # 1e-3 in singular values: two solutions fit alike
+        return None
+    homography: FloatArray = np.linalg.inv(t_points) @ vectors[:, 0].reshape(3, 3) @ t_places
+    return homography
+
+
+def mapped(homography: FloatArray, place: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Carry one place into the image.
+
+    Parameters
+    ----------
+    homography : ndarray, shape (3, 3)
+        From lattice to image.
+    place : ndarray, shape (2,)
+        The place.
+
+    Returns
+    -------
+    ndarray, shape (2,)
+        Image point, px.
+    ndarray, shape (2, 2)
+        Steps: how it moves, px, for one place along columns (row 0) and along rows (row 1).
+    """
+    x = homography @ np.array([place[0], place[1], 1.0])
+    point = x[:2] / x[2]
+    jacobian = (homography[:2, :2] - np.outer(point, homography[2, :2])) / x[2]
+    return point, jacobian.T
+
+
+def _normalised(points: FloatArray) -> tuple[FloatArray | None, FloatArray]:
+    """Move to the centroid and scale to a mean distance of sqrt(2)."""
+    centre = points.mean(axis=0)
+    spread = float(np.linalg.norm(points - centre, axis=1).mean())
+    if not spread > 0:
+        return None, np.eye(3)
+    scale = np.sqrt(2) / spread
+    transform = np.array(
+        [[scale, 0, -scale * centre[0]], [0, scale, -scale * centre[1]], [0, 0, 1]]
+    )
+    return (points - centre) * scale, transform
+
+
+def _local_map(
+    node: Node,
+    nodes: Nodes,
+    candidates: Candidates,
+    *,
+    least: int = MIN_NEIGHBOURS,
+    with_itself: bool = False,
+) -> tuple[FloatArray, FloatArray] | None:
+    """Predict image point and steps at a place from the discs around it."""
+    near = [
+        (i, j)
+        for i in range(-REACH, REACH + 1)
+        for j in range(-REACH, REACH + 1)
+        if (i or j or with_itself) and (node[0] + i, node[1] + j) in nodes
+    ]
+    if len(near) < least:
+        return None
+    index = [nodes[node[0] + i, node[1] + j] for i, j in near]
+    homography = plane_homography(np.array(near, dtype=np.float64), candidates.xy_px[index])
+    if homography is None or abs(homography[2, 2]) < 1e-12:
+        return None
+    return mapped(homography, np.zeros(2))
+
+
+def _size_ratio(index: int, steps: FloatArray, candidates: Candidates, grid: DiscGrid) -> float:
+    expected = expected_radius(steps, grid)
+    return float(candidates.radius_px[index]) / expected if expected > 0 else np.inf
+
+
+def _badness(
+    index: int, local: tuple[FloatArray, FloatArray], candidates: Candidates, grid: DiscGrid
+) -> float:
+    """Return error over tolerance, of place or of size, whichever is worse; above 1 is bad."""
+    point, steps = local
+    ratio = _size_ratio(index, steps, candidates, grid)
+    if not np.isfinite(ratio):
+        return np.inf
+    offset = np.linalg.solve(steps.T, candidates.xy_px[index] - point)
+    classes = np.unique(grid.diameters_mm / grid.disc_diameter_mm)
+    size = float(np.abs(np.log(ratio / classes)).min() / np.log(SIZE_TOLERANCE))
+    return max(float(np.linalg.norm(offset)) / PLACE_TOLERANCE, size)
+
+
+def _pruned(nodes: Nodes, candidates: Candidates, grid: DiscGrid) -> Nodes:
+    """Take out the discs that fit worst in their own surroundings until all fit."""
+    nodes = dict(nodes)
+    ratios = size_ratios(nodes, candidates, grid)
+    known = ratios[np.isfinite(ratios)]
+    if len(known) and abs(np.log(np.median(known))) > np.log(SIZE_TOLERANCE):
+        return {}  # another lattice, for instance every second disc
+    while True:
+        bad = {}
+        for node, index in nodes.items():
+            local = _local_map(node, nodes, candidates)
+            badness = 0.0 if local is None else _badness(index, local, candidates, grid)
+            if badness > 1:
+                bad[node] = badness
+        # a bad disc spoils its neighbours' predictions: only the worst of each group goes
+        worst = [
+            node
+            for node, badness in bad.items()
+            if all(
+                badness >= bad.get((node[0] + i, node[1] + j), 0.0)
+                for i in range(-REACH, REACH + 1)
+                for j in range(-REACH, REACH + 1)
+            )
+        ]
+        if not worst:
+            return nodes
+        for node in worst:
+            del nodes[node]
+
+
+def _fill(nodes: Nodes, candidates: Candidates, grid: DiscGrid) -> Nodes:
+    """Find free candidates at the empty places in the lattice's bounding box and around it."""
+    added: Nodes = {}
+    if not nodes:
+        return added
+    taken = set(nodes.values())
+    i, j = np.array(list(nodes)).T
+    # one place more on each side: growing stops where perspective is steep
+    columns, rows = (range(int(part.min()) - 1, int(part.max()) + 2) for part in (i, j))
+    for node in product(columns, rows):
+        local = None if node in nodes else _local_map(node, nodes, candidates)
+        if local is None:
+            continue
+        claims = _claims(local, candidates, grid, taken)
+        if claims:
+            added[node] = claims[0][1]
+            taken.add(claims[0][1])
+    return added
+
+
+def _claims(
+    local: tuple[FloatArray, FloatArray], candidates: Candidates, grid: DiscGrid, taken: set[int]
+) -> list[tuple[float, int]]:
+    """Return (badness, candidate) of the free candidates that fit a place, best first."""
+    reach = PLACE_TOLERANCE * float(np.linalg.norm(local[1], axis=1).sum())
+    if not np.isfinite(local[0]).all() or not np.isfinite(reach):
+        return []
+    near = candidates.tree.query_ball_point(local[0], reach)
+    rated = ((_badness(i, local, candidates, grid), int(i)) for i in near if i not in taken)
+    return sorted(claim for claim in rated if claim[0] <= 1)
+
+
+def _with_best_claims(nodes: Nodes, candidates: Candidates, grid: DiscGrid) -> Nodes:
+    """Give each place to the candidate that fits it clearly best."""
+    taken = set(nodes.values())
+    result = dict(nodes)
+    for node, index in nodes.items():
+        local = _local_map(node, nodes, candidates)
+        rivals = [] if local is None else _claims(local, candidates, grid, taken)
+        if local is None or not rivals:
+            continue
+        badness, rival = rivals[0]
+        own = _badness(index, local, candidates, grid)
+        if badness < own / 2:
+            result[node] = rival
+        elif badness < 2 * own:
+            x, y = candidates.xy_px[index]
+            raise DetectionError(
+                f"two candidates claim one place of the grid near ({x:.0f}, {y:.0f}) px; "
+                "the labels are ambiguous",
+                remedy="cover or remove other round things near the target",
+            )
+    return result

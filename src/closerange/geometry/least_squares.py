@@ -1,0 +1,165 @@
+"""Non-linear least squares for small dense problems (Levenberg-Marquardt)."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import TypeAlias
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from closerange.geometry.arrays import FloatArray
+
+Residuals: TypeAlias = Callable[[FloatArray], tuple[FloatArray, FloatArray]]
+"""x (p,) -> residuals (n,) and their Jacobian (n, p)."""
+
+# Damping beyond which a step no longer changes float64 parameters: there is no way down.
+LARGEST_DAMPING = 1e12
+# A step whose predicted gain is below this share of the cost moves x by less than 1e-7 of its
+# standard deviation times sqrt(n); more digits would only be rounding.
+GAIN_LIMIT = 1e-14
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class LeastSquaresFit:
+    """Where the search ended.
+
+    Attributes
+    ----------
+    x : ndarray, shape (p,)
+        Best parameters found.
+    residuals : ndarray, shape (n,)
+        At `x`.
+    jacobian : ndarray, shape (n, p)
+        Derivatives of the residuals at `x`.
+    cost : float
+        Sum of squared residuals at `x`; infinite if they are not finite at the start.
+    iterations : int
+        Steps tried, rejected ones included.
+    converged : bool
+        False if the iterations ran out or no way down was found.
+    """
+
+    x: FloatArray
+    residuals: FloatArray
+    jacobian: FloatArray
+    cost: float
+    iterations: int
+    converged: bool
+
+    def covariance(self, variance: float = 1.0) -> FloatArray:
+        """Propagate the residuals' variance into the parameters.
+
+        Parameters
+        ----------
+        variance : float, optional
+            Variance of each residual; 1 for residuals divided by their standard deviation,
+            cost / (n - p) to let the residuals speak.
+
+        Returns
+        -------
+        ndarray, shape (p, p)
+            ``variance * inverse(J'J)``, infinite if J'J is singular.
+        """
+        scale = _column_scale(self.jacobian)
+        scaled = self.jacobian / scale
+        try:
+            inverse = np.linalg.inv(scaled.T @ scaled)
+        except np.linalg.LinAlgError:
+            return np.full((self.x.size, self.x.size), np.inf)
+        return np.asarray(variance * inverse / np.outer(scale, scale))
+
+
+def levenberg_marquardt(
+    function: Residuals,
+    start: ArrayLike,
+    *,
+    max_iterations: int = 100,
+    step_limit: float = 1e-10,
+    damping: float = 1e-3,
+) -> LeastSquaresFit:
+    """Minimise a sum of squares.
+
+    Parameters
+    ----------
+    function : callable
+        ``function(x) -> (residuals (n,), jacobian (n, p))``. Residuals that are not finite
+        reject the step, so a model may answer NaN outside its domain.
+    start : array_like, shape (p,)
+        First guess.
+    max_iterations : int, optional
+        Largest number of steps tried.
+    step_limit : float, optional
+        The search has converged when a step is below this share of x, each parameter weighed
+        by the length of its Jacobian column.
+    damping : float, optional
+        First damping, relative to the diagonal of J'J.
+
+    Returns
+    -------
+    LeastSquaresFit
+        The best point found; never worse than the start.
+
+    Notes
+    -----
+    Marquardt's scaling makes the search independent of the parameters' units
+    (doi:10.1137/0111030). Columns of zeros are allowed: their parameters stay where they are.
+    """
+    x = np.array(start, dtype=np.float64)
+    residuals, jacobian = function(x)
+    cost = _cost(residuals)
+    iterations, converged = 0, cost == 0
+    while np.isfinite(cost) and not converged and iterations < max_iterations:
+        scale = _column_scale(jacobian)
+        scaled = jacobian / scale
+        gradient, normal = scaled.T @ residuals, scaled.T @ scaled
+        step = _solve(scaled, normal, residuals, gradient, damping)
+        gain = float(step @ (damping * step - gradient))
+        small = np.linalg.norm(step) <= step_limit * (np.linalg.norm(x * scale) + step_limit)
+        # Strong damping makes any step small; only a lightly damped one proves a minimum.
+        if damping <= 1 and gain <= GAIN_LIMIT * cost:
+            converged = True
+            break
+        iterations += 1
+        trial = x + step / scale
+        trial_residuals, trial_jacobian = function(trial)
+        trial_cost = _cost(trial_residuals)
+        if trial_cost <= cost and np.isfinite(trial_jacobian).all():
+            x, residuals, jacobian, cost = trial, trial_residuals, trial_jacobian, trial_cost
+            damping = max(damping / 10, 1e-12)
+        else:
+            damping *= 10
+        converged = bool(small and damping <= 1) or cost == 0
+        if damping > LARGEST_DAMPING:
+            break
+    return LeastSquaresFit(x, residuals, jacobian, cost, iterations, bool(converged))
+
+
+def _cost(residuals: FloatArray) -> float:
+    cost = float(residuals @ residuals)
+    return cost if np.isfinite(cost) else np.inf
+
+
+def _column_scale(jacobian: FloatArray) -> FloatArray:
+    """Length of each column, 1 for a column of zeros."""
+    length = np.sqrt(np.einsum("np,np->p", jacobian, jacobian))
+    return np.where(length > 0, length, 1.0)
+
+
+def _solve(
+    scaled: FloatArray,
+    normal: FloatArray,
+    residuals: FloatArray,
+    gradient: FloatArray,
+    damping: float,
+) -> FloatArray:
+    """Solve the damped normal equations, or the equations themselves where those are singular."""
+    size = gradient.size
+    try:
+        lower = np.linalg.cholesky(normal + damping * np.eye(size))
+        return np.asarray(-np.linalg.solve(lower.T, np.linalg.solve(lower, gradient)))
+    except np.linalg.LinAlgError:
+        rows = np.vstack([scaled, np.sqrt(damping) * np.eye(size)])
+        right = np.concatenate([-residuals, np.zeros(size)])
+        return np.asarray(np.linalg.lstsq(rows, right, rcond=None)[0])

@@ -1,0 +1,391 @@
+"""The single-point test of chapter 3: accuracy, repeatability and what they are worth."""
+
+from __future__ import annotations
+
+import warnings
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from closerange.errors import CloseRangeWarning, DataError, InputError
+from closerange.features.control import ControlPoints
+from closerange.flags import Flag
+from closerange.geometry.arrays import FloatArray, IntArray
+from closerange.geometry.covariance import mahalanobis_squared
+from closerange.position.positions import Positions
+from closerange.verification.acceptance import (
+    ACCEPT,
+    UNDECIDED,
+    AcceptanceReport,
+    Limits,
+    Prediction,
+    Repeatability,
+    judge_all,
+    overall_decision,
+)
+from closerange.verification.control_check import left_out_rows, usable
+from closerange.verification.statistics import (
+    ErrorSummary,
+    LuckOfTest,
+    PooledStd,
+    axis_slopes,
+    half_range_by_luck,
+    pooled_std,
+    region_coverage,
+    summarise_errors,
+    worst_error_by_luck,
+    worst_std_by_luck,
+)
+
+POSITIONS, READINGS = 90, 10
+"""Size of the test in A15.05, as chapter 3 reports it."""
+
+REFERENCE_RATIO = 4.0
+"""How many times better than the limit a reference must be to prove anything about it."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Groups:
+    """Readings by position; P positions of N used rows."""
+
+    key: tuple[tuple[str, str], ...]
+    group: IntArray  # (N,) position of each row
+    count: IntArray  # (P,)
+    mean: FloatArray  # (P, 3)
+    deviation: FloatArray  # (N, 3) of each row from its mean
+    std: FloatArray  # (P, 3), NaN for one reading
+    range: FloatArray  # (P, 3), NaN for one reading
+    flags: IntArray  # (P,)
+    frozen: NDArray[np.bool_]  # (P,)
+    total: FloatArray  # (P, 3, 3) predicted covariance of one reading
+    noise: FloatArray | None  # (P, 3, 3) the part of it that differs between readings
+
+    @property
+    def scatter_count(self) -> IntArray:
+        """Readings that tell about repeatability: none of a frozen position."""
+        return np.where(self.frozen, 0, self.count)
+
+
+def single_point_test(
+    positions: Positions,
+    truth: ControlPoints,
+    *,
+    cycle_time_s: float | None = None,
+    limits: Limits | None = None,
+    gauge_std_mm: float | None = None,
+    noise_cov_mm2: ArrayLike | None = None,
+) -> AcceptanceReport:
+    """Evaluate repeated readings of a target at known positions (chapter 3, after A15.05).
+
+    Parameters
+    ----------
+    positions : Positions
+        Readings; those of one (placement, point) belong to one position. Flagged rows are left
+        out and listed.
+    truth : ControlPoints
+        Actual positions.
+    cycle_time_s : float, optional
+        Time from the command to the result.
+    limits : Limits, optional
+        Gives a decision.
+    gauge_std_mm : float, optional
+        Standard deviation of the actual positions; replaces the `std_mm` of `truth`.
+    noise_cov_mm2 : array_like, shape (M, 3, 3), optional
+        Part of `positions.cov_mm2` that differs between readings. Without it that part is
+        estimated from the readings, as one share of the whole covariance for all positions.
+
+    Returns
+    -------
+    AcceptanceReport
+        Errors are actual minus mean, as in the thesis (the opposite of `compare_with_control`).
+
+    Raises
+    ------
+    DataError
+        If no usable reading has a truth.
+    InputError
+        If `gauge_std_mm` or `cycle_time_s` is negative.
+    """
+    for name, value in (("gauge_std_mm", gauge_std_mm), ("cycle_time_s", cycle_time_s)):
+        if value is not None and not value >= 0:
+            raise InputError(f"{name} is {value}", remedy="give a number of at least 0")
+    truth_row = truth.rows_for(positions.placement, positions.point)
+    known, good = truth_row >= 0, usable(positions)
+    if not (known & good).any():
+        raise DataError(
+            f"none of {len(positions)} readings is usable and has one of {len(truth)} truths",
+            remedy="use the same names of placements and points in both tables",
+        )
+    groups = _group(positions, known & good, noise_cov_mm2)
+    row = truth.rows_for(*zip(*groups.key, strict=True))
+    reference = np.full(len(row), gauge_std_mm) if gauge_std_mm is not None else truth.std_mm[row]
+    notes = _Notes(
+        missing=tuple(key for key, has in zip(positions.keys(), known, strict=True) if not has),
+        left_out=left_out_rows(positions.select(known), good[known]),
+        cycle_time_s=np.nan if cycle_time_s is None else float(cycle_time_s),
+        dof=positions.dof,
+    )
+    report = _evaluate(groups, truth.xyz_mm[row], reference, limits, notes)
+    for text in report.warnings:
+        warnings.warn(text, CloseRangeWarning, stacklevel=2)
+    return report
+
+
+@dataclass(frozen=True, slots=True)
+class _Notes:
+    """What the report says besides the figures."""
+
+    missing: tuple[tuple[str, str, str], ...]
+    left_out: tuple[tuple[str, str, str, str], ...]
+    cycle_time_s: float
+    dof: int | None
+
+
+def _group(positions: Positions, used: NDArray[np.bool_], noise_cov: ArrayLike | None) -> _Groups:
+    rows = positions.select(used)
+    keys = list(zip(rows.placement, rows.point, strict=True))
+    found = set(keys)
+    # in the order of the table, whichever of their readings are left out
+    order = dict.fromkeys(zip(positions.placement, positions.point, strict=True))
+    number = {key: i for i, key in enumerate(key for key in order if key in found)}
+    group = np.array([number[key] for key in keys])
+    count = np.bincount(group)
+    mean = _mean_of(rows.xyz_mm, group, count)
+    deviation = rows.xyz_mm - mean[group]
+    squares = _mean_of(deviation**2, group, count)
+    low, high = np.full_like(mean, np.inf), np.full_like(mean, -np.inf)
+    np.minimum.at(low, group, rows.xyz_mm)
+    np.maximum.at(high, group, rows.xyz_mm)
+    several = (count > 1)[:, None]
+    bessel = count[:, None] / np.maximum(count - 1, 1)[:, None]
+    frozen = (count > 1) & (high == low).all(axis=1)
+    flags = np.where(frozen, int(Flag.frozen), 0)
+    np.bitwise_or.at(flags, group, rows.flags)
+    noise = None
+    if noise_cov is not None:
+        stated = np.broadcast_to(np.asarray(noise_cov, np.float64), (len(positions), 3, 3))
+        noise = _mean_of(stated[used], group, count)
+    return _Groups(
+        key=tuple(number),
+        group=group,
+        count=count,
+        mean=mean,
+        deviation=deviation,
+        # equal readings differ from their rounded mean: a frozen position has exactly no scatter
+        std=np.where(several, np.where(frozen[:, None], 0.0, np.sqrt(squares * bessel)), np.nan),
+        range=np.where(several, high - low, np.nan),
+        flags=flags,
+        frozen=frozen,
+        total=_mean_of(rows.cov_mm2, group, count),
+        noise=noise,
+    )
+
+
+def _mean_of(values: FloatArray, group: IntArray, count: IntArray) -> FloatArray:
+    """Average rows by group."""
+    total = np.zeros((len(count), *values.shape[1:]))
+    np.add.at(total, group, values)
+    mean: FloatArray = total / count.reshape(-1, *(1,) * (values.ndim - 1))
+    return mean
+
+
+def _evaluate(
+    groups: _Groups,
+    truth: FloatArray,
+    reference: FloatArray,
+    limits: Limits | None,
+    notes: _Notes,
+) -> AcceptanceReport:
+    error = truth - groups.mean
+    accuracy = summarise_errors(error)
+    pooled = pooled_std(groups.std, groups.scatter_count)
+    share = _noise_share(groups)
+    predicted = _predicted_of_mean(groups, share) + reference[:, None, None] ** 2 * np.eye(3)
+    judgements = judge_all(
+        accuracy,
+        pooled,
+        limits,
+        reference_mm=float(reference.max()),
+        cycle_time_s=notes.cycle_time_s,
+    )
+    decision = overall_decision(item.decision for item in judgements)
+    marked = bool((groups.flags & int(Flag.frozen | Flag.untrusted)).any())
+    return AcceptanceReport(
+        placement=tuple(placement for placement, _ in groups.key),
+        point=tuple(point for _, point in groups.key),
+        count=groups.count,
+        truth_mm=truth,
+        mean_mm=groups.mean,
+        std_mm=groups.std,
+        range_mm=groups.range,
+        predicted_cov_mm2=predicted,
+        flags=groups.flags,
+        accuracy=accuracy,
+        repeatability=Repeatability(pooled, _worst(groups.std), _worst(groups.range)),
+        luck=_luck(groups),
+        slopes=axis_slopes(error, truth),
+        coverage=region_coverage(error, predicted, dof=notes.dof),
+        prediction=_prediction(groups, share, error, predicted, pooled),
+        reference_std_mm=float(reference.max()),
+        cycle_time_s=notes.cycle_time_s,
+        limits=limits,
+        judgements=judgements,
+        decision=UNDECIDED if marked and decision == ACCEPT else decision,
+        missing=notes.missing,
+        left_out=notes.left_out,
+        deviations=_deviations(groups, truth, reference, notes),
+        warnings=_warnings(groups, accuracy, float(reference.max()), limits, notes),
+    )
+
+
+def _noise_share(groups: _Groups) -> float:
+    """Return which share of a reading's predicted variance differs between readings."""
+    if groups.noise is not None:
+        variances = [np.trace(cov, axis1=1, axis2=2).sum() for cov in (groups.noise, groups.total)]
+        return float(variances[0] / variances[1])
+    return float(np.clip(_scatter_ratio(groups), 0.0, 1.0))
+
+
+def _scatter_ratio(groups: _Groups) -> float:
+    """Return the pooled observed variance relative to the whole predicted one; NaN if unknown."""
+    definite = np.asarray(np.isfinite(groups.total).all(axis=(1, 2)))
+    definite[definite] = np.linalg.eigvalsh(groups.total[definite])[:, 0] > 0
+    kept = definite & (groups.scatter_count > 1)
+    if not kept.any():
+        return float("nan")
+    square = mahalanobis_squared(groups.deviation, groups.total[groups.group])
+    return float(square[kept[groups.group]].sum() / (3 * (groups.count[kept] - 1).sum()))
+
+
+def _predicted_of_mean(groups: _Groups, share: float) -> FloatArray:
+    """Predict the covariance of the mean of M readings: only the noise is averaged."""
+    averaged = (1 - 1 / groups.count)[:, None, None]
+    if groups.noise is not None:
+        return groups.total - averaged * groups.noise
+    # scatter of one shape with the whole covariance keeps the difference positive definite
+    return groups.total * (1 - averaged * (0.0 if np.isnan(share) else share))
+
+
+def _prediction(
+    groups: _Groups,
+    share: float,
+    error: FloatArray,
+    predicted: FloatArray,
+    pooled: PooledStd,
+) -> Prediction:
+    scatter = groups.total if groups.noise is None else groups.noise
+    weight = np.maximum(groups.scatter_count - 1, 0)
+    by_reading = np.full((3, 3), np.nan)
+    if weight.any():
+        by_reading = np.average(scatter[weight > 0], axis=0, weights=weight[weight > 0])
+    return Prediction(
+        noise_share=share,
+        accuracy_ratio=_ratio((error**2).mean(axis=0), predicted.mean(axis=0)),
+        repeatability_ratio=_ratio(pooled.std_mm**2, by_reading),
+        noise_stated=groups.noise is not None,
+    )
+
+
+def _ratio(observed_variance: FloatArray, predicted: FloatArray) -> FloatArray:
+    """Return observed / predicted standard deviations of X, Y, Z and in space."""
+    expected = np.diag(predicted)
+    expected = np.append(expected, expected.sum())
+    observed = np.append(observed_variance, observed_variance.sum())
+    ratio = np.full(4, np.nan)
+    known = expected > 0
+    ratio[known] = np.sqrt(observed[known] / expected[known])
+    return ratio
+
+
+def _worst(values: FloatArray) -> FloatArray:
+    """Return the largest of each axis, NaN if there is none."""
+    known = values[np.isfinite(values).all(axis=1)]
+    return known.max(axis=0) if len(known) else np.full(3, np.nan)
+
+
+def _luck(groups: _Groups) -> LuckOfTest:
+    """Chance alone, for the commonest number of readings."""
+    several = groups.scatter_count[groups.scatter_count > 1]
+    readings = int(np.bincount(several).argmax()) if several.size else 0
+    return LuckOfTest(
+        worst_std_by_luck(len(several), readings),
+        worst_error_by_luck(len(groups.key)),
+        half_range_by_luck(len(groups.key)),
+    )
+
+
+def _deviations(
+    groups: _Groups, truth: FloatArray, reference: FloatArray, notes: _Notes
+) -> tuple[str, ...]:
+    """List what differs from A15.05 as section 3.2 of the thesis describes it."""
+    fewest = int(groups.count.min())
+    found = [
+        (len(groups.key) < POSITIONS, f"{len(groups.key)} positions instead of {POSITIONS}"),
+        (
+            fewest < READINGS,
+            f"as few as {fewest} readings of a position instead of {READINGS}",
+        ),
+        (_in_steps(truth), "the positions lie in regular steps instead of at random"),
+        (np.isnan(notes.cycle_time_s), "the cycle time is unknown"),
+        (
+            not reference.any(),
+            "the uncertainty of the actual positions is not stated; they are taken as exact",
+        ),
+        (bool(notes.left_out), f"{len(notes.left_out)} flagged readings were left out"),
+        (bool(notes.missing), f"{len(notes.missing)} readings have no actual position"),
+        (True, "target plate and test controller are not known to the program"),
+        (True, "the procedure is that of the thesis, section 3.2; the standard was not at hand"),
+    ]
+    return tuple(text for applies, text in found if applies)
+
+
+def _in_steps(truth: FloatArray) -> bool:
+    """Tell whether an axis takes few values: 90 random draws from 100 marks take 60."""
+    distinct = [len(np.unique(axis.round(6))) for axis in truth.T]
+    return len(truth) > 1 and min(distinct) <= len(truth) / 2
+
+
+def _warnings(
+    groups: _Groups,
+    accuracy: ErrorSummary,
+    reference_mm: float,
+    limits: Limits | None,
+    notes: _Notes,
+) -> tuple[str, ...]:
+    single, frozen = int((groups.count == 1).sum()), int(groups.frozen.sum())
+    total = len(groups.key)
+    strictest = np.nan if limits is None else np.fmin.reduce(limits.accuracy_mm)
+    proved = float(accuracy.max_mm[:3].min() if np.isnan(strictest) else strictest)
+    what = "accuracy found" if np.isnan(strictest) else "accuracy limit"
+    found = [
+        (
+            single,
+            (
+                f"{single} of {total} positions have one reading: one reading has no standard "
+                "deviation; take at least two"
+            ),
+        ),
+        (
+            frozen,
+            (
+                f"all readings of {frozen} of {total} positions are equal: a frozen image, or a "
+                "resolution coarser than the noise; they are left out of the repeatability"
+            ),
+        ),
+        (
+            reference_mm * REFERENCE_RATIO > proved,
+            (
+                f"the reference ({reference_mm:.4g} mm) is not {REFERENCE_RATIO:.0f} times better "
+                f"than the {what} ({proved:.4g} mm): it proves nothing below "
+                f"{REFERENCE_RATIO * reference_mm:.4g} mm"
+            ),
+        ),
+        (
+            (groups.flags & int(Flag.untrusted)).any(),
+            "the positions were measured with an untrustworthy rig: nothing is accepted",
+        ),
+        (len(notes.left_out), f"{len(notes.left_out)} flagged readings were left out"),
+        (len(notes.missing), f"{len(notes.missing)} readings have no actual position"),
+    ]
+    return tuple(text for applies, text in found if applies)

@@ -1,0 +1,173 @@
+"""The verb `detect`: images of a target become image points."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from pathlib import Path
+
+import numpy as np
+
+from closerange.errors import CloseRangeError, DetectionError, InputError
+from closerange.features.detect import detect_target
+from closerange.features.image_points import ImagePoints
+from closerange.features.target import Target
+from closerange.features.target_file import read_target
+from closerange.files import read_csv
+from closerange.images import (
+    Frame,
+    check_frame,
+    list_images,
+    placement_and_reading,
+    read_image,
+)
+
+Progress = Callable[[int, int], None]
+Images = str | Path | Frame | Sequence[str | Path | Frame]
+
+__all__ = ["Images", "Progress", "detect", "read_crops"]
+
+
+def detect(
+    images: Images,
+    *,
+    target: Target | Path | str,
+    camera: str,
+    placement: str | None = None,
+    placement_pattern: str | None = None,
+    estimator: str = "least-squares",
+    crops: Mapping[str, tuple[float, float]] | Path | str | None = None,
+    progress: Progress | None = None,
+) -> ImagePoints:
+    """Find a target in the images of one camera.
+
+    Parameters
+    ----------
+    images : path, folder, Frame or sequence of these
+        Several images are several placements.
+    target : Target or path
+        What to look for; a TOML file or a `Target`.
+    camera : str
+        Name of the camera that took the images.
+    placement : str, optional
+        Name of the placement; with one image only. By default each image is a placement named
+        by its file's stem.
+    placement_pattern : str, optional
+        Regular expression searched in the stem: group 1 names the placement, a group named
+        ``reading`` the repeated reading.
+    estimator : str, optional
+        ``least-squares`` or ``border-centroid`` (the thesis' eq. 2.7).
+    crops : mapping or path, optional
+        For images cut out of larger ones: full-image px of each crop's pixel (0, 0), by file
+        name; or a CSV file with ``image, x0_px, y0_px``.
+    progress : callable, optional
+        Called with (done, total) after each image.
+
+    Returns
+    -------
+    ImagePoints
+        All points of the target in each image; those not found are NaN and flagged.
+
+    Raises
+    ------
+    InputError
+        If an image, the target or the pattern cannot be used.
+    DetectionError
+        If a target is not, or not unambiguously, in an image; the message names the image.
+    """
+    if not isinstance(target, Target):
+        target = read_target(target)
+    sources = _sources(images)
+    if placement is not None and len(sources) > 1:
+        raise InputError(
+            f"one placement name for {len(sources)} images",
+            remedy="use --placement-pattern, or name one image",
+        )
+    offsets = _offsets(crops)
+    found: ImagePoints | None = None
+    for done, source in enumerate(sources, start=1):
+        frame = source if isinstance(source, Frame) else read_image(source, camera=camera)
+        name, reading = _names(frame, placement, placement_pattern)
+        points = _detect_one(frame, target, name, reading, estimator)
+        if offsets is not None:
+            points = points.shifted(_offset_of(frame, offsets))
+        found = points if found is None else _joined(found, points, frame)
+        if progress:
+            progress(done, len(sources))
+    if found is None:
+        raise InputError("no image was named", remedy="name at least one image or folder")
+    return found
+
+
+def read_crops(path: Path | str) -> dict[str, tuple[float, float]]:
+    """Read where crops were cut out: CSV with ``image, x0_px, y0_px``.
+
+    Parameters
+    ----------
+    path : Path or str
+        The file; `image` is a file name without folders.
+
+    Returns
+    -------
+    dict of str to (float, float)
+        Full-image px of each crop's pixel (0, 0).
+
+    Raises
+    ------
+    TableError
+        If a row breaks the contract.
+    """
+    table = read_csv(path, required=("image", "x0_px", "y0_px"))
+    corners = zip(table.floats("x0_px"), table.floats("y0_px"), strict=True)
+    return dict(zip(table.texts("image"), corners, strict=True))
+
+
+def _sources(images: Images) -> list[Path | Frame]:
+    listed: Iterable[str | Path | Frame] = (
+        [images] if isinstance(images, (str, Path, Frame)) else images
+    )
+    sources: list[Path | Frame] = []
+    for image in listed:
+        sources.extend([image] if isinstance(image, Frame) else list_images(Path(image)))
+    return sources
+
+
+def _names(frame: Frame, placement: str | None, pattern: str | None) -> tuple[str, str]:
+    if placement is not None:
+        return placement, ""
+    return placement_and_reading(Path(frame.source), pattern)
+
+
+def _detect_one(
+    frame: Frame, target: Target, placement: str, reading: str, estimator: str
+) -> ImagePoints:
+    try:
+        check_frame(frame)
+        return detect_target(
+            frame, target, placement=placement, reading=reading, estimator=estimator
+        )
+    except DetectionError as error:
+        if frame.source and frame.source not in error.message:
+            raise DetectionError(f"{frame.source}: {error.message}", remedy=error.remedy) from error
+        raise
+
+
+def _joined(found: ImagePoints, points: ImagePoints, frame: Frame) -> ImagePoints:
+    try:
+        return found + points
+    except CloseRangeError as error:
+        raise InputError(f"{frame.source}: {error.message}", remedy=error.remedy) from error
+
+
+def _offsets(
+    crops: Mapping[str, tuple[float, float]] | Path | str | None,
+) -> Mapping[str, tuple[float, float]] | None:
+    return read_crops(crops) if isinstance(crops, (str, Path)) else crops
+
+
+def _offset_of(frame: Frame, offsets: Mapping[str, tuple[float, float]]) -> np.ndarray:
+    name = Path(frame.source).name
+    if name not in offsets:
+        raise InputError(
+            f"{frame.source}: no row for {name!r} in the table of crops", remedy="add the row"
+        )
+    return np.array(offsets[name])
