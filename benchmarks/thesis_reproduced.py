@@ -2,7 +2,7 @@
 
     python benchmarks/thesis_reproduced.py                 write the page
     python benchmarks/thesis_reproduced.py --check         compare with the committed page
-    python benchmarks/thesis_reproduced.py --data FOLDER   folder with A_calib_discs and A_verify
+    python benchmarks/thesis_reproduced.py --data FOLDER   folder laid out as the demonstration data
 
 Nothing is random but the seeded synthetic scenes: the same data give the same page.
 """

@@ -32,6 +32,8 @@ python_maximum_signature_line_length = 80
 napoleon_google_docstring = False
 napoleon_use_ivar = True  # dataclass fields are described once, in Attributes
 napoleon_use_rtype = False
+# annotations name types without their modules; two rooms may have a type of one name
+suppress_warnings = ["ref.python"]
 
 ROOMS = {
     "foundations": ("errors", "flags", "files"),

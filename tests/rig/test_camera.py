@@ -112,7 +112,8 @@ def test_a_point_behind_the_camera_is_nan_not_mirrored(lens):
     camera = make(LENSES[lens][0])
     forward = camera.camera_from_world.rotation[2]
     behind = camera.centre_mm - 100 * forward
-    seen = camera.project([behind, camera.centre_mm, camera.centre_mm + 100 * forward])
+    just_behind = camera.centre_mm - 1e-6 * forward
+    seen = camera.project([behind, just_behind, camera.centre_mm + 100 * forward])
     assert np.isnan(seen[:2]).all()
     assert np.isfinite(seen[2]).all()
     assert np.isnan(camera.project_jacobian([behind])).all()

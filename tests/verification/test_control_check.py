@@ -32,12 +32,19 @@ def positions_of(xyz, *, placement=None, point=None, flags=None, cov=np.nan):
     )
 
 
-def thesis_table(shared, count):
-    """Read a table of chapter 2; the placement is the run and row, the point the dot's place."""
+def thesis_table(shared, count, *, restore=False):
+    """Read a table of chapter 2; the placement is the run and row, the point the dot's place.
+
+    Cells of which only the magnitude of the error survives are lost, or restored with an error
+    of unknown, here positive, sign: that leaves averages of absolute errors what they were.
+    """
     with (shared / "data/thesis" / TABLES[count]).open(encoding="utf-8") as stream:
         rows = list(csv.DictReader(stream))
     original = np.array([[float(row[name]) for name in ("Xo", "Yo", "Zo")] for row in rows])
     calculated = np.array([[float(row[n] or "nan") for n in ("X", "Y", "Z")] for row in rows])
+    if restore:
+        size = np.array([[float(row[n] or "nan") for n in ("eX", "eY", "eZ")] for row in rows])
+        calculated = np.where(np.isnan(calculated), original + size, calculated)
     placement = tuple(f"{count}-{row['row']}" for row in rows)
     point = tuple(f"{row['Xo']}/{row['Yo']}" for row in rows)
     role = [row["role"] for row in rows]
@@ -50,7 +57,7 @@ def thesis_table(shared, count):
 
 @pytest.mark.parametrize("count", [18, 27])
 def test_averages_of_the_thesis_are_recomputed(shared, count):
-    check = compare_with_control(*thesis_table(shared, count))
+    check = compare_with_control(*thesis_table(shared, count, restore=True))
     known = json.loads((shared / "data/thesis/averages_check.json").read_text())[str(count)]
     for axis, name in enumerate("XYZP"):
         # printed to five digits from errors that were rounded to five digits

@@ -14,7 +14,6 @@ from closerange.delivery.svg import (
     AXIS_COLOURS,
     BLUE,
     FULL_WIDTH,
-    INK,
     PURPLE,
     RULE,
     SOFT,

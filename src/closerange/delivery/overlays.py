@@ -146,6 +146,7 @@ def make_overlay(
     points: ImagePoints,
     *,
     placement: str | None = None,
+    reading: str | None = None,
     residuals: Residuals | None = None,
 ) -> Overlay:
     """Put a frame and its points together for a report.
@@ -158,6 +159,8 @@ def make_overlay(
         Any table; the rows of the frame's camera and of one placement are taken.
     placement : str, optional
         Which placement; not needed if the camera's rows are all of one.
+    reading : str, optional
+        Which reading; the first one of the table without it.
     residuals : Residuals, optional
         Of a calibration; drawn as vectors on the points that it knows.
 
@@ -181,6 +184,8 @@ def make_overlay(
         )
     name = placement if placement is not None else (placements or [""])[0]
     chosen = chosen.select([row == name for row in chosen.placement])
+    wanted = reading if reading is not None else next(iter(chosen.reading), "")
+    chosen = chosen.select([row == wanted for row in chosen.reading])
     return Overlay(
         camera=frame.camera,
         placement=name,
@@ -210,7 +215,7 @@ def draw_overlay(overlay: Overlay) -> Markup:
     """
     width, height = overlay.size_px
     scale = (FULL_WIDTH / 2) / width
-    found = np.isfinite(overlay.xy_px).all(axis=1)
+    found = np.asarray(np.isfinite(overlay.xy_px).all(axis=1))
     flagged = int((overlay.flags != 0).sum())
     drawing = Drawing(
         FULL_WIDTH / 2,

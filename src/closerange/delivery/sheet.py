@@ -9,10 +9,10 @@ from typing import Any, TypeAlias
 from markupsafe import Markup
 
 from closerange.delivery.overlays import Overlay
-from closerange.delivery.volume_plots import ErrorMap
 from closerange.features.image_points import ImagePoints
 from closerange.position.positions import Positions
 from closerange.rig.rig import Rig
+from closerange.verification.error_map import ErrorMap
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -84,7 +84,7 @@ class Drawing:
     description: str
     _parts: list[Markup] = field(default_factory=list)
 
-    def add(self, tag: str, content: str = "", **attributes: str | float) -> None:
+    def add(self, tag: str, content: str = "", /, **attributes: str | float) -> None:
         """Append an element; underscores in attribute names become hyphens.
 
         Parameters

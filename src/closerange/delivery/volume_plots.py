@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Protocol
 
 import numpy as np
 from markupsafe import Markup
@@ -11,7 +10,6 @@ from markupsafe import Markup
 from closerange.delivery.svg import (
     AXIS_COLOURS,
     FULL_WIDTH,
-    INK,
     PAPER,
     SOFT,
     Drawing,
@@ -20,38 +18,14 @@ from closerange.delivery.svg import (
     heat_legend,
     ink_on,
     nice_step,
-    tick_text,
     units,
 )
 from closerange.delivery.wording import fixed, micrometres
 from closerange.geometry.arrays import FloatArray
+from closerange.verification.error_map import ErrorMap
 
 _MAX_LEVELS = 3  # lowest, middle, highest: what a page shows without hiding one by another
 _PRINTED_CELLS = 9  # up to this many in a row a number of four digits fits into a cell
-
-
-class ErrorMap(Protocol):
-    """Predicted standard deviation on a regular grid in the measuring volume; M nodes."""
-
-    @property
-    def xyz_mm(self) -> FloatArray:
-        """Nodes, shape (M, 3), in C order over (ix, iy, iz)."""
-        ...
-
-    @property
-    def shape(self) -> tuple[int, int, int]:
-        """Nodes along X, Y and Z."""
-        ...
-
-    @property
-    def std_mm(self) -> FloatArray:
-        """Predicted standard deviation of one position, shape (M, 3)."""
-        ...
-
-    @property
-    def calibration_std_mm(self) -> FloatArray:
-        """The part of it that comes from the calibration, shape (M, 3)."""
-        ...
 
 
 def draw_volume(error_map: ErrorMap) -> Markup:
@@ -69,6 +43,8 @@ def draw_volume(error_map: ErrorMap) -> Markup:
     """
     nodes, std = _on_grid(error_map)
     total_um = 1000 * np.sqrt((std**2).sum(axis=3))
+    known = total_um[np.isfinite(total_um)]
+    ends = (known.min(), known.max()) if known.size else (np.nan, np.nan)
     top = _round_top(total_um)
     picked = _levels(nodes.shape[2])[::-1]
     tallest = 122.0
@@ -76,8 +52,8 @@ def draw_volume(error_map: ErrorMap) -> Markup:
         FULL_WIDTH,
         64 + len(picked) * (tallest + 16),
         "Predicted error in the measuring volume",
-        f"From {micrometres(np.nanmin(total_um) / 1000)} to {micrometres(np.nanmax(total_um) / 1000)} µm "
-        "in space, one standard deviation",
+        f"From {micrometres(ends[0] / 1000)} to "
+        f"{micrometres(ends[1] / 1000)} µm in space, one standard deviation",
     )
     x_edges, y_edges = _edges(nodes[:, 0, 0, 0]), _edges(nodes[0, :, 0, 1])
     for row, level in enumerate(picked):
@@ -138,7 +114,9 @@ def draw_slices(error_map: ErrorMap, axis: int) -> Markup:
 class _Shelf:
     """A level seen from above at a slant: X to the right, Y to the back."""
 
-    def __init__(self, x_edges: FloatArray, y_edges: FloatArray, *, top: float, height: float):
+    def __init__(
+        self, x_edges: FloatArray, y_edges: FloatArray, *, top: float, height: float
+    ) -> None:
         span_x, span_y = float(np.ptp(x_edges)), float(np.ptp(y_edges))
         # Y is foreshortened to a half and slanted by a third, as in a cabinet projection
         scale = min(2 * height / span_y, 330.0 / (span_x + 0.35 * span_y))

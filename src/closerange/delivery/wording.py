@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import math
 import re
+from collections.abc import Iterable
 
 from closerange.flags import Flag
 
-DASH = "–"
+DASH = "\u2013"
 """Stands for a value that does not exist; the row's flags say why."""
 
 FLAG_WORDS: dict[Flag, str] = {
@@ -88,6 +89,19 @@ def short_length(value_mm: float) -> str:
 def printed(text: str) -> str:
     """Set the sign for micrometres in texts that were written for a terminal."""
     return _MICROMETRES.sub("µm", text)
+
+
+def three_micrometres(values_mm: Iterable[float]) -> str:
+    """Write X, Y and Z for a sentence: ``4.0 µm (X) 4.1 µm (Y) 9.2 µm (Z)``."""
+    return " ".join(
+        f"{short_length(float(value))} ({axis})"
+        for value, axis in zip(values_mm, "XYZ", strict=False)
+    )
+
+
+def percent(share: float) -> str:
+    """Write a share as a percentage with one decimal."""
+    return DASH if not math.isfinite(share) else f"{fixed(100 * share, 1)} %"
 
 
 def flag_names(flags: int) -> list[str]:

@@ -18,7 +18,7 @@ from closerange.errors import DetectionError
 from closerange.features.corner_fit import CornerFits, fit_corners
 from closerange.features.grid_checking import mapped, plane_homography
 from closerange.features.grid_orientation import ROLL_LIMIT_RAD, roll_rad
-from closerange.features.target import Charuco, Chessboard
+from closerange.features.pattern import Charuco, Chessboard
 from closerange.flags import Flag
 from closerange.geometry.arrays import FloatArray, IntArray
 from closerange.images.frame import Frame
@@ -217,7 +217,8 @@ def _eight_bit(frame: Frame) -> NDArray[Any]:
         return frame.pixels
     low, high = np.percentile(frame.pixels, [0.1, 99.9])
     scaled = (frame.pixels - low) * (255 / max(high - low, 1.0))
-    return np.clip(scaled, 0, 255).astype(np.uint8)
+    stretched: NDArray[Any] = np.clip(scaled, 0, 255).astype(np.uint8)
+    return stretched
 
 
 def _places(rows: int, columns: int) -> FloatArray:
@@ -248,7 +249,7 @@ def _roll(xy: FloatArray) -> float:
 
 def _measured(frame: Frame, xy: FloatArray, places: FloatArray, share: float) -> Corners:
     """Fit every corner that was found; keep OpenCV's position where the fit fails."""
-    known = np.isfinite(xy).all(axis=1)
+    known = np.asarray(np.isfinite(xy).all(axis=1))
     steps, spacing = _steps(xy, places, known)
     radius = np.clip(share * spacing, MIN_RADIUS_PX, MAX_RADIUS_PX)
     fits = fit_corners(frame.pixels, xy[known], steps[known], radius[known])

@@ -167,7 +167,8 @@ def _start(windows: _Windows, steps_px: FloatArray) -> FloatArray:
 def _distance(offset: FloatArray, angle: FloatArray) -> FloatArray:
     """Return signed distances from lines through the origin."""
     normal = np.stack([-np.sin(angle), np.cos(angle)], axis=-1)
-    return np.einsum("npk,nk->np", offset, normal)
+    distance: FloatArray = np.einsum("npk,nk->np", offset, normal)
+    return distance
 
 
 def _linearised(windows: _Windows, unknowns: FloatArray) -> tuple[FloatArray, FloatArray]:

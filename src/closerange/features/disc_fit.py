@@ -30,6 +30,7 @@ QUANTISATION_DN2 = 1 / 12
 # Share of the edge profile below which a pixel is flat, and how many flat pixels give a variance
 # of their own (to a quarter of its value).
 FLAT_SHARE, FLAT_PIXELS = 0.03, 30
+IMAGINED_PIXELS = 2
 # A blur beyond 0.02 .. 50 px is not what this model describes.
 LARGEST_LOG_BLUR = 4.0
 MAX_PASSES = 4
@@ -110,7 +111,8 @@ def fit_disc(
     """
     crop = _Crop.around(pixels, start, other)
     x = _start_vector(start, blur_px)
-    variances = None
+    variances: tuple[float, float] | None = None
+    result = NOT_MEASURED
     for _ in range(MAX_PASSES):
         band = crop.band(x, variances, full_scale)
         if band is None:
@@ -121,12 +123,14 @@ def fit_disc(
         fit = levenberg_marquardt(band.residuals, free, max_iterations=MAX_ITERATIONS)
         if not np.isfinite(fit.cost):
             return NOT_MEASURED
+        # Settled: with weights from residuals, on a band that lies where the disc really is.
         settled = variances is not None and not _moved(x, fit.x)
+        result = _result(fit, band, crop.origin, settled=settled)
+        if settled:
+            break
         x = np.append(fit.x, np.zeros(x.size - fit.x.size))
         variances = band.variances_after(fit)
-        if settled:  # with weights from residuals, on the band where the disc really is
-            break
-    return _result(fit, band, crop.origin)
+    return result
 
 
 # Parameters: centre x, y and shape xx, xy, yy as in `distance_terms`; logarithm of the blur;
@@ -177,7 +181,7 @@ class _Crop:
         xy, values, distance = self.xy[chosen], self.values[chosen], distance[chosen]
         inside = ndtr(-distance / blur)
         if variances is None:
-            variances = _spread(values[inside < 0.5]), _spread(values[inside >= 0.5])
+            variances = _first_variances(values, inside)
         variance = variances[0] + (variances[1] - variances[0]) * inside
         clips = bool((values >= full_scale).any())
         return _Band(xy, values, inside, np.sqrt(variance), full_scale if clips else np.inf)
@@ -227,12 +231,30 @@ class _Band:
         """Grey-value variance outside and inside, from the residuals where the disc is flat."""
         kept, factor = self.counted(fit)
         squares = factor * (fit.residuals[:-1] * self.std) ** 2
-        pooled = squares[kept].mean() if kept.any() else 0.0
+        mixed: FloatArray | None = None
         found = []
-        for flat in (self.inside < FLAT_SHARE, self.inside > 1 - FLAT_SHARE):
+        for side, flat in enumerate((self.inside < FLAT_SHARE, self.inside > 1 - FLAT_SHARE)):
             chosen = squares[flat & kept]
-            found.append(chosen.mean() if chosen.size >= FLAT_PIXELS else pooled)
+            if chosen.size >= FLAT_PIXELS:
+                found.append(float(chosen.mean()))
+                continue
+            if mixed is None:
+                mixed = self._mixed_variances(squares, kept)
+            found.append(float(mixed[side]))
         return max(found[0], QUANTISATION_DN2), max(found[1], QUANTISATION_DN2)
+
+    def _mixed_variances(self, squares: FloatArray, kept: BoolArray) -> FloatArray:
+        """Variances outside and inside of a small disc, from all pixels by their share of it."""
+        weight = 1 / self.std[kept] ** 2
+        shares = np.column_stack([1 - self.inside[kept], self.inside[kept]]) * weight[:, None]
+        # A dozen pixels can drive one variance to zero or below; a few imagined pixels of the
+        # mean variance on either side keep the weights sane.
+        mean = float(squares[kept].mean()) if kept.any() else QUANTISATION_DN2
+        imagined = np.sqrt(IMAGINED_PIXELS) / mean
+        rows = np.vstack([shares, imagined * np.eye(2)])
+        right = np.append(squares[kept] * weight, [imagined * mean] * 2)
+        variances = np.linalg.lstsq(rows, right, rcond=None)[0]
+        return np.asarray(np.maximum(variances, 0.1 * mean))
 
 
 def _grey_values(x: FloatArray, xy: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -264,12 +286,16 @@ def _density(t: FloatArray) -> FloatArray:
     return np.asarray(np.exp(-0.5 * t * t) / np.sqrt(2 * np.pi))
 
 
-def _spread(values: FloatArray) -> float:
-    """Robust variance of one side, quantisation at least: a weight for the first pass only."""
-    if values.size == 0:
-        return 1.0
-    deviation = float(np.median(np.abs(values - np.median(values))))
-    return max((1.4826 * deviation) ** 2, QUANTISATION_DN2)
+def _first_variances(values: FloatArray, inside: FloatArray) -> tuple[float, float]:
+    """Robust variances of the flat sides: weights for the first pass only."""
+    found = []
+    for flat in (inside < FLAT_SHARE, inside > 1 - FLAT_SHARE):
+        chosen = values[flat]
+        if chosen.size < FLAT_PIXELS:
+            continue
+        deviation = float(np.median(np.abs(chosen - np.median(chosen))))
+        found.append(max((1.4826 * deviation) ** 2, QUANTISATION_DN2))
+    return (found[0], found[-1]) if found else (1.0, 1.0)
 
 
 def _start_vector(start: Ellipse, blur_px: float) -> FloatArray:
@@ -288,7 +314,7 @@ def _shortest_px(x: FloatArray) -> float:
     return axes_of_shape(*x[2:5])[1]
 
 
-def _result(fit: LeastSquaresFit, band: _Band, origin: FloatArray) -> DiscFit:
+def _result(fit: LeastSquaresFit, band: _Band, origin: FloatArray, *, settled: bool) -> DiscFit:
     """Turn the last pass into named results."""
     kept, factor = band.counted(fit)
     squares = fit.residuals[:-1][kept] ** 2
@@ -307,7 +333,7 @@ def _result(fit: LeastSquaresFit, band: _Band, origin: FloatArray) -> DiscFit:
         contrast=float(fit.x[CONTRAST]),
         noise=float(np.sqrt(np.mean(variances))),
         reduced_residual=float(np.sqrt(factor * squares[edge].mean())) if edge.any() else 1.0,
-        converged=fit.converged,
+        converged=fit.converged and settled,
     )
 
 

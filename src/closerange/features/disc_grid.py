@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from closerange.errors import DetectionError
-from closerange.features.grid_checking import clean, size_ratios
+from closerange.features.grid_checking import MIN_NEIGHBOURS, clean, size_ratios
 from closerange.features.grid_growing import Candidates, grow, lines, seeds
 from closerange.features.grid_orientation import (
     LEAST_SEEN,
@@ -14,7 +14,7 @@ from closerange.features.grid_orientation import (
     place_line,
     refusal,
 )
-from closerange.features.target import DiscGrid
+from closerange.features.pattern import DiscGrid
 from closerange.geometry.arrays import FloatArray, IntArray
 
 MOST_ATTEMPTS = 40
@@ -127,6 +127,8 @@ def _line(candidates: Candidates, grid: DiscGrid) -> IntArray:
 
 def _grid(candidates: Candidates, grid: DiscGrid) -> IntArray:
     """Find the one lattice that is the target; refuse if the rest holds another one."""
+    if grid.rows * grid.columns <= MIN_NEIGHBOURS:
+        return _only_lattice(candidates, grid)
     index = _first_lattice(candidates, grid)
     rest = np.setdiff1d(np.arange(len(candidates)), index)
     if len(rest) >= _least(grid):
@@ -138,6 +140,46 @@ def _grid(candidates: Candidates, grid: DiscGrid) -> IntArray:
             len(candidates), grid, "two such targets are in view", "leave one of them in view"
         )
     return index
+
+
+def _only_lattice(candidates: Candidates, grid: DiscGrid) -> IntArray:
+    """Find the only group of discs that fits.
+
+    In so small a grid the neighbours do not tell a disc's place to better than the first
+    guess, so every seed has its say and all must agree.
+    """
+    found: dict[tuple[int, ...], IntArray] = {}
+    failure: DetectionError | None = None
+    for seed in seeds(candidates, grid)[:MOST_ATTEMPTS]:
+        try:
+            nodes = clean(grow(seed, candidates, grid), candidates, grid)
+            if len(nodes) < _least(grid):
+                continue
+            ratios = size_ratios(nodes, candidates, grid)
+            index = place_lattice(nodes, ratios, candidates, grid)
+            found[tuple(index)] = index
+        except DetectionError as error:
+            failure = failure or error
+    if len(found) == 1:
+        return next(iter(found.values()))
+    if found:
+        raise refusal(
+            len(candidates),
+            grid,
+            f"{len(found)} groups of discs fit the target",
+            "leave one target in view, and no other round things near it",
+        )
+    raise failure or _no_lattice(candidates, grid, 0)
+
+
+def _no_lattice(candidates: Candidates, grid: DiscGrid, longest: int) -> DetectionError:
+    return refusal(
+        len(candidates),
+        grid,
+        f"at most {longest} stand in a grid of the target's pitch and diameter",
+        "bring the whole target into view, sharp and evenly lit; check pitch_mm, "
+        "disc_diameter_mm and polarity",
+    )
 
 
 def _least(grid: DiscGrid) -> int:
@@ -165,10 +207,4 @@ def _first_lattice(candidates: Candidates, grid: DiscGrid) -> IntArray:
             return place_lattice(nodes, size_ratios(nodes, candidates, grid), candidates, grid)
         except DetectionError as error:
             failure = failure or error
-    raise failure or refusal(
-        len(candidates),
-        grid,
-        f"at most {longest} stand in a grid of the target's pitch and diameter",
-        "bring the whole target into view, sharp and evenly lit; check pitch_mm, "
-        "disc_diameter_mm and polarity",
-    )
+    raise failure or _no_lattice(candidates, grid, longest)

@@ -1,4 +1,4 @@
-"""Checking a grown lattice: is each disc where, and as large as, its neighbours say?
+"""Checking a grown lattice: place and size of each disc by its neighbours.
 
 The neighbours up to two places away fix a local homography, which holds perspective exactly
 and lens distortion to the third order of the pitch. It predicts place and size of the disc in
@@ -11,9 +11,9 @@ from itertools import product
 
 import numpy as np
 
-from closerange.errors import DetectionError
 from closerange.features.grid_growing import Candidates, Node, Nodes, expected_radius
-from closerange.features.target import DiscGrid
+from closerange.features.grid_orientation import refusal
+from closerange.features.pattern import DiscGrid
 from closerange.geometry.arrays import FloatArray
 
 PLACE_TOLERANCE = 0.25
@@ -24,6 +24,10 @@ in a wide-angle image (0.2 pitches for 3 x 3 discs filling a 60 degree view at 1
 SIZE_TOLERANCE = 1.3
 """Largest factor between measured and predicted diameter. Blur and threshold change small
 discs by up to 10 %, a wide lens by up to 15 % towards the corners."""
+
+SHAPE_TOLERANCE = 1.4
+"""Largest factor between measured and predicted axis ratio: 20 % from an ellipse of two or
+three pixels' semi-axis, as much from perspective that four discs alone do not fix."""
 
 REACH = 2
 MIN_NEIGHBOURS = 6
@@ -198,13 +202,27 @@ def _badness(
 ) -> float:
     """Return error over tolerance, of place or of size, whichever is worse; above 1 is bad."""
     point, steps = local
-    ratio = _size_ratio(index, steps, candidates, grid)
-    if not np.isfinite(ratio):
+    if not abs(np.linalg.det(steps)) > 0:
         return np.inf
     offset = np.linalg.solve(steps.T, candidates.xy_px[index] - point)
+    return max(
+        float(np.linalg.norm(offset)) / PLACE_TOLERANCE,
+        _form_badness(index, steps, candidates, grid),
+    )
+
+
+def _form_badness(index: int, steps: FloatArray, candidates: Candidates, grid: DiscGrid) -> float:
+    """Return error over tolerance of size or axis ratio, whichever is worse."""
+    ratio = _size_ratio(index, steps, candidates, grid)
+    if not 0 < ratio < np.inf:
+        return np.inf
     classes = np.unique(grid.diameters_mm / grid.disc_diameter_mm)
-    size = float(np.abs(np.log(ratio / classes)).min() / np.log(SIZE_TOLERANCE))
-    return max(float(np.linalg.norm(offset)) / PLACE_TOLERANCE, size)
+    size = np.abs(np.log(ratio / classes)).min() / np.log(SIZE_TOLERANCE)
+    # the disc's own ellipse turns the plate's unit vectors back into a right-angled pair
+    plate = candidates.whitener[index] @ (steps.T / np.array(grid.pitch_mm))
+    longest, shortest = np.linalg.svd(plate, compute_uv=False)
+    shape = np.log(longest / shortest) / np.log(SHAPE_TOLERANCE)
+    return float(max(size, shape))
 
 
 def _pruned(nodes: Nodes, candidates: Candidates, grid: DiscGrid) -> Nodes:
@@ -218,7 +236,11 @@ def _pruned(nodes: Nodes, candidates: Candidates, grid: DiscGrid) -> Nodes:
         bad = {}
         for node, index in nodes.items():
             local = _local_map(node, nodes, candidates)
-            badness = 0.0 if local is None else _badness(index, local, candidates, grid)
+            if local is not None:
+                badness = _badness(index, local, candidates, grid)
+            else:  # too few around it to tell its place, but perhaps its form
+                local = _local_map(node, nodes, candidates, least=4, with_itself=True)
+                badness = 0.0 if local is None else _form_badness(index, local[1], candidates, grid)
             if badness > 1:
                 bad[node] = badness
         # a bad disc spoils its neighbours' predictions: only the worst of each group goes
@@ -284,9 +306,10 @@ def _with_best_claims(nodes: Nodes, candidates: Candidates, grid: DiscGrid) -> N
             result[node] = rival
         elif badness < 2 * own:
             x, y = candidates.xy_px[index]
-            raise DetectionError(
-                f"two candidates claim one place of the grid near ({x:.0f}, {y:.0f}) px; "
-                "the labels are ambiguous",
-                remedy="cover or remove other round things near the target",
+            raise refusal(
+                len(candidates),
+                grid,
+                f"two of them claim one place of the grid near ({x:.0f}, {y:.0f}) px",
+                "cover or remove other round things near the target",
             )
     return result

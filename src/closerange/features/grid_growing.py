@@ -17,7 +17,7 @@ from typing import Any, TypeAlias
 import numpy as np
 from scipy.spatial import cKDTree
 
-from closerange.features.target import DiscGrid
+from closerange.features.pattern import DiscGrid
 from closerange.geometry.arrays import FloatArray, IntArray
 
 SEED_TOLERANCE = 0.25

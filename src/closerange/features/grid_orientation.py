@@ -14,7 +14,7 @@ import numpy as np
 
 from closerange.errors import DetectionError
 from closerange.features.grid_growing import Candidates, Nodes
-from closerange.features.target import DiscGrid
+from closerange.features.pattern import DiscGrid
 from closerange.geometry.arrays import FloatArray, IntArray
 
 ROLL_LIMIT_RAD = float(np.radians(40))
@@ -292,7 +292,7 @@ def _roll(ij: IntArray, xy_px: FloatArray, grid: DiscGrid) -> float:
 
 
 def _class_numbers(grid: DiscGrid) -> IntArray:
-    """Number the diameters of the target's discs in ascending order; shape (N,)."""
+    """Give numbers to the diameters of the target's discs in ascending order; shape (N,)."""
     return np.unique(grid.diameters_mm, return_inverse=True)[1].reshape(-1).astype(np.int64)
 
 

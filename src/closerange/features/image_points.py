@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from pathlib import Path
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -217,6 +218,12 @@ class ImagePoints:
             Covariances and ellipses are unchanged; image sizes are forgotten.
         """
         return replace(self, xy_px=self.xy_px + np.asarray(offset_px), size_px={})
+
+    def to_csv(self, path: Path | str) -> None:
+        """Write the points table; see `closerange.features.points_table`."""
+        from closerange.features.points_table import write_points  # noqa: PLC0415  # cycle
+
+        write_points(self, path)
 
 
 def _size(size_px: tuple[int, int]) -> str:

@@ -10,7 +10,7 @@ from pathlib import Path
 from closerange.errors import FileError
 
 MAX_TEXT_BYTES = 16 * 2**20
-"""Largest JSON or TOML file read (16 MiB: a rig of 100 000 residuals stays below)."""
+"""Largest JSON or TOML file read by default; rigs and results state larger limits of their own."""
 
 MAX_TABLE_BYTES = 512 * 2**20
 """Largest CSV table read (512 MiB: about five million rows)."""
@@ -51,7 +51,7 @@ def read_limited(path: Path | str, max_bytes: int) -> bytes:
                     f"{path}: {status.st_size} bytes, the limit is {max_bytes}",
                     remedy="split the file or name the right one",
                 )
-            content = stream.read(max_bytes + 1)
+            content = stream.read(status.st_size + 1)  # reserves what it is asked for
     except FileNotFoundError as error:
         raise FileError(f"{path}: no such file", remedy="check the path") from error
     except OSError as error:

@@ -77,6 +77,7 @@ def measure_points(rig: Rig, points: ImagePoints) -> Positions:
         cameras=used,
         flags=flags,
         dof=None if observed.own_cov else rig.dof,
+        image_cov_mm2=solution.image_cov_mm2,
     )
 
 

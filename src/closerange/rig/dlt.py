@@ -171,7 +171,9 @@ def require_spatial(xyz_mm: FloatArray) -> None:
     """
     centred = xyz_mm - xyz_mm.mean(axis=0)
     axes = np.linalg.svd(centred, full_matrices=False)[2]
-    extent, width, thickness = np.ptp(centred @ axes.T, axis=0)
+    _, width, thickness = np.ptp(centred @ axes.T, axis=0)
+    # not the range along the first axis: that axis is arbitrary for square and round sets
+    extent = 2 * float(np.linalg.norm(centred, axis=1).max())
     depth = USEFUL_THICKNESS * extent
     if extent <= 0:
         raise GeometryError(

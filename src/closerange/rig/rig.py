@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -171,6 +172,12 @@ class Rig:
             (i, name) for i, name in enumerate(self.parameters) if name.rpartition(".")[0] == camera
         ]
         return [name.removeprefix(prefix) for _, name in found], [i for i, _ in found]
+
+    def to_json(self, path: Path | str) -> None:
+        """Write the rig file; see `closerange.rig.rig_file`."""
+        from closerange.rig.rig_file import write_rig  # noqa: PLC0415  # cycle
+
+        write_rig(self, path)
 
     @property
     def trusted(self) -> bool:

@@ -44,19 +44,24 @@ def write_rig(rig: Rig, path: Path | str) -> None:
     Raises
     ------
     SchemaError
-        If the rig holds what the schema cannot (NaN in a camera, an unknown lens).
+        If the rig holds what the schema cannot (NaN in a camera, an unknown lens) or is too large.
     FileError
         If it cannot be written.
     """
     try:
         text = _readable(rig_to_document(rig)) + "\n"
-        text.encode("utf-8")
+        size = len(text.encode("utf-8"))
     except SchemaError:
         raise
     except ValueError as error:  # infinity, or half a surrogate pair
         raise SchemaError(
             f"{path}: the rig cannot be written ({error})", remedy="calibrate again"
         ) from error
+    if size > MAX_RIG_BYTES:
+        raise SchemaError(
+            f"{path}: the rig has {size} bytes, the limit is {MAX_RIG_BYTES}",
+            remedy="calibrate with fewer points",
+        )
     rig_from_document(parse_json(text, source=str(path)), source=str(path))
     write_text(path, text)
 

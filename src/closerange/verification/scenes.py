@@ -132,13 +132,13 @@ def looking_at_origin(
 
 
 def rig_a() -> SyntheticRig:
-    """Make a long-lens rig: 1.5 m away, f = 4800 px, at most 0.4 px of distortion."""
+    """Make a long-lens rig: 1.5 m away, f = 4800 px, at most 0.5 px of distortion."""
     lens = BrownIdeal(k1=-0.15, k2=0.05, p1=0.001, p2=-0.0005)
     return _pair("A", distance_mm=1500.0, focal_px=4800.0, offset_px=(9.0, 7.0), lens=lens)
 
 
 def rig_b() -> SyntheticRig:
-    """Make a short-lens rig: 0.35 m away, f = 1300 px, about 10 px of distortion."""
+    """Make a short-lens rig: 0.35 m away, f = 1300 px, up to 12 px of distortion."""
     lens = BrownIdeal(k1=-0.15, k2=0.05, p1=0.001, p2=-0.0005)
     return _pair("B", distance_mm=350.0, focal_px=1300.0, offset_px=(9.0, 7.0), lens=lens)
 
@@ -149,7 +149,7 @@ def strong_lens_rig(*, distance_mm: float = 225.0) -> SyntheticRig:
     Parameters
     ----------
     distance_mm : float, optional
-        At 225 mm the cube's corners are displaced by 88 px, at 350 mm by 18 px.
+        At 225 mm the cube's corners are displaced by 87 px, at 350 mm by 18 px.
 
     Returns
     -------

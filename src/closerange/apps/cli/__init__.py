@@ -1,0 +1,11 @@
+"""The command line: parses, calls a workflow, prints; nothing else."""
+
+from closerange.apps.cli.commands import app
+
+
+def main() -> None:
+    """Run the command line."""
+    app()
+
+
+__all__ = ["app", "main"]

@@ -1,0 +1,77 @@
+"""Options that several verbs share, and how their texts are read."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from closerange.errors import InputError
+
+if TYPE_CHECKING:
+    from closerange.verification.acceptance import Limits
+
+Json = Annotated[bool, typer.Option("--json", help="Print a machine-readable summary on stdout.")]
+Report = Annotated[
+    Path | None, typer.Option("--report", metavar="report.html", help="Also write a report.")
+]
+Overwrite = Annotated[
+    bool, typer.Option("--overwrite", help="Replace an existing folder of results.")
+]
+
+
+def output(example: str) -> Any:
+    """Return the option ``-o FILE``, shown with an example of a name."""
+    return typer.Option(
+        "-o", "--output", metavar=example, help="File to write; replaced whole or not at all."
+    )
+
+
+def image_sizes(texts: Sequence[str]) -> dict[str, tuple[int, int]]:
+    """Read ``NAME=WxH`` options.
+
+    Parameters
+    ----------
+    texts : sequence of str
+        One for each camera.
+
+    Returns
+    -------
+    dict of str to (int, int)
+        Width and height in px by camera.
+
+    Raises
+    ------
+    InputError
+        If a text has another form, or a camera is named twice.
+    """
+    sizes: dict[str, tuple[int, int]] = {}
+    for text in texts:
+        name, _, size = text.rpartition("=")
+        match = re.fullmatch(r"([1-9]\d{0,5})x([1-9]\d{0,5})", size, re.ASCII)
+        if not name or not match:
+            raise InputError(
+                f"--image-size {text!r}: expected NAME=WxH",
+                remedy="for instance --image-size left=1280x1024",
+            )
+        if name in sizes:
+            raise InputError(
+                f"--image-size names camera {name!r} twice", remedy="give one size for each camera"
+            )
+        sizes[name] = int(match[1]), int(match[2])
+    return sizes
+
+
+def limits(
+    accuracy_mm: tuple[float, float, float] | None,
+    repeatability_mm: tuple[float, float, float] | None,
+) -> Limits | None:
+    """Put permissible errors together; None if none is given."""
+    if accuracy_mm is None and repeatability_mm is None:
+        return None
+    from closerange.verification.acceptance import Limits
+
+    return Limits.of(accuracy_mm=accuracy_mm, repeatability_mm=repeatability_mm)

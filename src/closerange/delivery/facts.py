@@ -1,0 +1,121 @@
+"""Nested facts (options, choices, hashes) as tables that a person can read."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator, Mapping
+from typing import Any
+
+from closerange.delivery.excerpts import shown
+from closerange.delivery.sheet import Block, Section, Table
+from closerange.delivery.wording import DASH, printed, significant
+
+_HASH = re.compile(r"[0-9a-f]{64}")
+_UNITS = {"mm": "mm", "mm2": "mm²", "px": "px", "px2": "px²", "rad": "rad", "s": "s"}
+
+
+def provenance_section(provenance: Mapping[str, Any]) -> Section | None:
+    """Name versions, options and input hashes.
+
+    Parameters
+    ----------
+    provenance : mapping
+        JSON-ready; a mapping whose values are SHA-256 digests becomes a table of files.
+
+    Returns
+    -------
+    Section or None
+        None if nothing is known.
+    """
+    blocks = fact_blocks("Program and options", provenance)
+    return Section("provenance", "Versions and inputs", tuple(blocks)) if blocks else None
+
+
+def fact_blocks(caption: str, facts: Mapping[str, Any]) -> list[Block]:
+    """Turn nested facts into tables.
+
+    Parameters
+    ----------
+    caption : str
+        Of the table of single facts.
+    facts : mapping
+        JSON-ready. Lists of mappings become tables of their own, hashes as well.
+
+    Returns
+    -------
+    list of Block
+        Empty if there are no facts.
+    """
+    singles: list[tuple[str, str]] = []
+    tables: list[Block] = []
+    for path, value in _walk("", facts):
+        if _is_hashes(value):
+            rows = [(str(name), str(digest)) for name, digest in value.items()]
+            head = ("file", "SHA-256")
+            tables.append(Table(words(path), head, rows, texts=frozenset({0, 1}), wide=True))
+        elif _is_rows(value):
+            tables.append(_rows_table(words(path), value))
+        else:
+            singles.append((words(path), _text(value)))
+    if singles:
+        head = ("name", "value")
+        tables.insert(0, shown(singles, caption, head, texts=frozenset({0, 1})))
+    return tables
+
+
+def words(name: str) -> str:
+    """Write a field name as words: ``cross_validation_px`` is ``cross validation [px]``."""
+    stem, _, unit = name.rpartition("_")
+    if stem and unit in _UNITS:
+        return f"{stem.replace('_', ' ')} [{_UNITS[unit]}]"
+    return name.replace("_", " ")
+
+
+def _walk(path: str, value: Any) -> Iterator[tuple[str, Any]]:
+    """Yield (path, value) of everything that is not a plain mapping."""
+    if isinstance(value, Mapping) and not _is_hashes(value):
+        for key, item in value.items():
+            yield from _walk(f"{path}: {key}" if path else str(key), item)
+    elif value not in (None, "", [], ()):
+        yield path, value
+
+
+def _is_hashes(value: Any) -> bool:
+    return (
+        isinstance(value, Mapping)
+        and bool(value)
+        and all(isinstance(item, str) and _HASH.fullmatch(item) for item in value.values())
+    )
+
+
+def _is_rows(value: Any) -> bool:
+    return (
+        isinstance(value, list | tuple)
+        and bool(value)
+        and all(isinstance(item, Mapping) for item in value)
+    )
+
+
+def _rows_table(caption: str, rows: list[Mapping[str, Any]]) -> Table:
+    names = list(dict.fromkeys(str(key) for row in rows for key in row))
+    cells = [[_text(row.get(name)) for name in names] for row in rows]
+    texts = frozenset(
+        column
+        for column, name in enumerate(names)
+        if not all(isinstance(row.get(name), int | float | None) for row in rows)
+    )
+    return shown(cells, caption, tuple(words(name) for name in names), texts=texts)
+
+
+def _text(value: Any) -> str:
+    if isinstance(value, bool):
+        return "yes" if value else "no"
+    if isinstance(value, int):
+        return str(value)
+    if isinstance(value, float):
+        return significant(value, 4)
+    if isinstance(value, Mapping):
+        return ", ".join(f"{words(str(key))} {_text(item)}" for key, item in value.items())
+    if isinstance(value, list | tuple):
+        return ", ".join(_text(item) for item in value)
+    return DASH if value is None else printed(str(value))

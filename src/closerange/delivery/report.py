@@ -1,0 +1,203 @@
+"""The report: one HTML file that a customer can be handed."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+from jinja2 import Environment, PackageLoader, StrictUndefined
+from markupsafe import Markup, escape
+
+from closerange.delivery.calibration_section import calibration_section
+from closerange.delivery.check_sections import check_sections
+from closerange.delivery.facts import provenance_section
+from closerange.delivery.front_page import figures_table, front_picture, verdict
+from closerange.delivery.glossary import glossary_section, words_in
+from closerange.delivery.overlays import Overlay
+from closerange.delivery.report_sections import (
+    flags_section,
+    measured_section,
+    pictures_section,
+    points_section,
+    positions_section,
+    prediction_section,
+)
+from closerange.delivery.sheet import Contents, Paragraph, Section, Table, Terms
+from closerange.delivery.wording import printed
+from closerange.features.image_points import ImagePoints
+from closerange.position.positions import Positions
+from closerange.rig.rig import Rig
+from closerange.verification.error_map import ErrorMap
+from closerange.version import __version__
+
+
+def render_report(  # noqa: PLR0913 - each argument is one thing that a report may hold
+    *,
+    title: str,
+    rig: Rig | None = None,
+    points: ImagePoints | None = None,
+    overlays: Sequence[Overlay] = (),
+    positions: Positions | None = None,
+    checks: Sequence[object] = (),
+    error_map: ErrorMap | None = None,
+    provenance: Mapping[str, Any] | None = None,
+    notes: Sequence[str] = (),
+    headline: str | None = None,
+) -> str:
+    """Render a report as one self-contained HTML file.
+
+    Parameters
+    ----------
+    title : str
+        Name of the job.
+    rig : Rig, optional
+        Calibrated cameras.
+    points : ImagePoints, optional
+        Detected points.
+    overlays : sequence of Overlay, optional
+        Pictures with what was found on them; about 100 kB each.
+    positions : Positions, optional
+        Measured positions.
+    checks : sequence of object, optional
+        Verification results (`ControlCheck`, `AcceptanceReport`, `LengthCheck`) or their stored
+        documents.
+    error_map : ErrorMap, optional
+        Predicted error in the volume.
+    provenance : mapping, optional
+        Versions, options, input hashes: JSON-ready.
+    notes : sequence of str, optional
+        Warnings.
+    headline : str, optional
+        The verdict in one sentence; made from the data without it.
+
+    Returns
+    -------
+    str
+        HTML that needs no other file, no script and no network; the same for the same input.
+        Sections without data are left out.
+    """
+    contents = Contents(
+        title=title,
+        rig=rig,
+        points=points,
+        overlays=tuple(overlays),
+        positions=positions,
+        checks=documents_of(checks),
+        error_map=error_map,
+        provenance=provenance or {},
+        notes=tuple(notes),
+        headline=headline,
+    )
+    return _render(contents)
+
+
+def documents_of(checks: Sequence[object]) -> tuple[Mapping[str, Any], ...]:
+    """Turn verification results into their documents; documents stay as they are.
+
+    Parameters
+    ----------
+    checks : sequence of object
+        Results with a `to_document` method, or mappings.
+
+    Returns
+    -------
+    tuple of mapping
+        In the same order.
+
+    Raises
+    ------
+    TypeError
+        If something is neither.
+    """
+    documents: list[Mapping[str, Any]] = []
+    for check in checks:
+        document = check if isinstance(check, Mapping) else None
+        if document is None and hasattr(check, "to_document"):
+            document = check.to_document()
+        if not isinstance(document, Mapping):
+            raise TypeError(f"{type(check).__name__} is not a verification result")
+        documents.append(document)
+    return tuple(documents)
+
+
+def _render(contents: Contents) -> str:
+    front_table = figures_table(contents)
+    sections = _sections(contents)
+    spoken = " ".join(_spoken(sections, front_table))
+    glossary = glossary_section(spoken)
+    if glossary is not None:
+        sections.append(glossary)
+    known = {word for word, _ in _entries(glossary)}
+    environment = Environment(
+        loader=PackageLoader("closerange.delivery", "templates"),
+        autoescape=True,
+        undefined=StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+    )
+    environment.filters["linked"] = lambda text: _linked(text, known)
+    return environment.get_template("report.html.j2").render(
+        contents=contents,
+        verdict=verdict(contents),
+        picture=front_picture(contents),
+        figures=front_table,
+        sections=sections,
+        version=__version__,
+    )
+
+
+def _sections(contents: Contents) -> list[Section]:
+    """Put the sections together, leaving out those without data."""
+    found = [
+        _notes_section(contents),
+        measured_section(contents),
+        *check_sections(contents.checks),
+        prediction_section(contents),
+        calibration_section(contents),
+        positions_section(contents),
+        points_section(contents),
+        pictures_section(contents),
+        flags_section(contents),
+        provenance_section(contents.provenance),
+    ]
+    return [section for section in found if section is not None]
+
+
+def _notes_section(contents: Contents) -> Section | None:
+    """List every warning once."""
+    texts = [*contents.notes]
+    for check in contents.checks:
+        texts += check.get("warnings") or ()
+    unique = dict.fromkeys(printed(str(text)) for text in texts)
+    blocks = tuple(Paragraph(text, "warn") for text in unique)
+    return Section("warnings", "Warnings", blocks) if blocks else None
+
+
+def _spoken(sections: Sequence[Section], table: Table | None) -> list[str]:
+    """Collect the words of a report, to explain those and only those."""
+    texts: list[str] = []
+    for block in (*([table] if table else []), *(b for part in sections for b in part.blocks)):
+        if isinstance(block, Table):
+            texts += [block.caption, *block.head, *(row[0] for row in block.rows if row)]
+        elif isinstance(block, Terms):
+            texts += [f"{word} {meaning}" for word, meaning in block.entries]
+        else:
+            texts.append(block.text if isinstance(block, Paragraph) else block.caption)
+    return texts
+
+
+def _entries(section: Section | None) -> list[tuple[str, str]]:
+    blocks = section.blocks if section is not None else ()
+    return [entry for block in blocks if isinstance(block, Terms) for entry in block.entries]
+
+
+def _linked(text: str, known: set[str]) -> Markup:
+    """Link the first word of the glossary in a text to its explanation."""
+    for word in words_in(text):
+        if word in known:
+            start = text.lower().index(word)
+            end = start + len(word)
+            anchor = word.replace(" ", "-").replace("%", "percent")
+            link = Markup('<a href="#word-{}">{}</a>').format(anchor, text[start:end])
+            return escape(text[:start]) + link + escape(text[end:])
+    return escape(text)

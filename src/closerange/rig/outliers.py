@@ -1,0 +1,273 @@
+"""Blunders: found by data snooping, left out of the fit, kept in the residuals and explained.
+
+A point is tested with the residual it has when it takes no part in the fit, against the noise of
+the other points (Baarda's data snooping with the variance estimated; doi:10.1007/BF02521811).
+Many blunders at once inflate that noise and hide each other; then a robust fit sorts the points
+first.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import TypeAlias
+
+import numpy as np
+
+from closerange.errors import GeometryError
+from closerange.geometry.arrays import BoolArray, FloatArray
+from closerange.rig.camera import Camera
+from closerange.rig.camera_fit import CameraFit, fit_camera, strong_parameters
+from closerange.rig.camera_start import affine_starts
+from closerange.rig.distortion import BrownIdeal
+from closerange.rig.view import View, whiten
+
+FALSE_ALARM = 0.01
+"""Chance that a calibration of clean Gaussian data loses any point; shared by all its points."""
+
+HIDDEN = 1.3
+"""Noise of the fit over noise of its better half that calls for a robust fit. One
+in seventy clean views of 27 points exceeds it; a wrong alarm costs time only, the test decides."""
+
+ROBUST_LIMIT = 13.8
+"""Squared residual over variance (two coordinates) beyond which the robust fit sets a point aside
+for the test: chance 1 in 1000, -2 ln 0.001."""
+
+MAX_SHARE = 0.5
+"""More than half of a camera's points cannot be blunders: nothing says which half is right."""
+
+ROUNDING_PX = 1e-6
+"""Smallest noise that is told from rounding: exact data have no blunders below it."""
+
+REWEIGHTINGS = 15
+STEPS_PER_REWEIGHTING = 4  # the weights change again before more would pay
+EXCHANGES = 50
+
+Fitter: TypeAlias = Callable[[View, Camera | None], CameraFit]
+"""Estimate a camera from a view, from a start if there is one."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class CleanFit:
+    """A fit without the points that contradict it.
+
+    Attributes
+    ----------
+    fit : CameraFit
+        Of the points kept.
+    kept : ndarray of bool, shape (N,)
+        Points that took part.
+    """
+
+    fit: CameraFit
+    kept: BoolArray
+
+
+def fit_without_blunders(
+    view: View, fitter: Fitter, *, robust_free: tuple[str, ...], trials: int
+) -> CleanFit:
+    """Fit a camera and leave out the points that contradict the others.
+
+    Parameters
+    ----------
+    view : View
+        All points of the camera.
+    fitter : callable
+        The estimator.
+    robust_free : tuple of str
+        Parameters of the least-squares fit that sorts the points when blunders hide each other.
+    trials : int
+        Points tested in the whole calibration, over which the false alarm is shared.
+
+    Returns
+    -------
+    CleanFit
+        All points are kept where no blunder is found, or where more than half would be left out.
+    """
+    everything = np.ones(len(view), dtype=bool)
+    plain = fitter(view, None)
+    hidden = _noise(plain) > HIDDEN * _inner_noise(plain.whitened, plain.dof)
+    if not hidden and (snoop(plain) <= limit(plain.dof - 2, trials)).all():
+        return CleanFit(plain, everything)
+    kept = _sorted_robustly(view, plain, robust_free) if hidden else everything
+    try:
+        clean = _exchange(view, fitter, kept, trials)
+    except GeometryError:  # too little is left to carry the parameters
+        return CleanFit(plain, everything)
+    if np.count_nonzero(~clean.kept) > MAX_SHARE * len(view):
+        return CleanFit(plain, everything)
+    return clean
+
+
+def snoop(fit: CameraFit) -> FloatArray:
+    """Test each fitted point against the others.
+
+    Parameters
+    ----------
+    fit : CameraFit
+        With at least three degrees of freedom.
+
+    Returns
+    -------
+    ndarray, shape (N,)
+        Externally studentised squared residual, F-distributed with 2 and dof - 2 degrees of
+        freedom; 0 for a point that the fit leans on so much that nothing tests it.
+    """
+    q = fit.orthonormal
+    rest = np.eye(2) - np.einsum("nip,njp->nij", q, q)
+    determinant = rest[:, 0, 0] * rest[:, 1, 1] - rest[:, 0, 1] ** 2
+    testable = determinant > 1e-9  # below, the deleted residual is rounding
+    x, y = fit.whitened.T
+    drop = rest[:, 1, 1] * x**2 - 2 * rest[:, 0, 1] * x * y + rest[:, 0, 0] * y**2
+    drop = np.where(testable, drop / np.where(testable, determinant, 1.0), 0.0)
+    dof = fit.dof - 2
+    if dof < 1:
+        return np.zeros(len(drop))
+    others = np.maximum((fit.chi_square - drop) / dof, _floor(fit))
+    statistic: FloatArray = drop / 2 / others
+    return statistic
+
+
+def limit(dof: int, trials: int) -> float:
+    """Return the critical value of `snoop`.
+
+    Parameters
+    ----------
+    dof : int
+        Second degrees of freedom; infinite below 1.
+    trials : int
+        Number of points over which `FALSE_ALARM` is shared (Bonferroni).
+
+    Returns
+    -------
+    float
+        Upper quantile of F(2, dof), which has a closed form.
+    """
+    if dof < 1:
+        return float("inf")
+    return float(dof / 2 * ((FALSE_ALARM / trials) ** (-2 / dof) - 1))
+
+
+def predicted(fit: CameraFit, view: View) -> FloatArray:
+    """Test points that took no part in a fit; see `snoop`.
+
+    Parameters
+    ----------
+    fit : CameraFit
+        Of other points.
+    view : View
+        The points to be tested.
+
+    Returns
+    -------
+    ndarray, shape (N,)
+        F-distributed with 2 and dof degrees of freedom.
+    """
+    camera = fit.camera
+    residual = view.xy_px - camera.project(view.xyz_mm)
+    jacobian = np.moveaxis(camera.parameter_jacobian(view.xyz_mm, fit.free), 0, 2)
+    white, columns = whiten(view.whitener, residual.T, np.swapaxes(jacobian, 0, 1))
+    spread = np.einsum("pin,pq->nqi", columns, fit.root)
+    cov = np.eye(2) + np.einsum("nqi,nqj->nij", spread, spread)
+    usable = np.isfinite(cov).all(axis=(1, 2)) & np.isfinite(white).all(axis=0)
+    cov[~usable] = np.eye(2)
+    white = np.where(usable, white, 0.0)
+    square = np.einsum("in,ni->n", white, np.linalg.solve(cov, white.T[..., None])[..., 0])
+    variance = max(fit.chi_square / max(fit.dof, 1), _floor(fit))
+    statistic: FloatArray = np.where(usable, square / 2 / variance, np.inf)
+    return statistic
+
+
+def _exchange(view: View, fitter: Fitter, kept: BoolArray, trials: int) -> CleanFit:
+    """Take back what fits, leave out the worst that does not, until neither is there."""
+    seen: set[bytes] = set()
+    start: Camera | None = None
+    for _ in range(EXCHANGES):
+        fit = fitter(view.select(kept), start)
+        start = fit.camera
+        left = np.flatnonzero(~kept)
+        back = left[predicted(fit, view.select(~kept)) <= limit(fit.dof, trials)]
+        statistic = np.zeros(len(view))
+        statistic[kept] = snoop(fit)
+        worst = int(np.argmax(statistic))
+        changed = kept.copy()
+        changed[back] = True
+        if statistic[worst] > limit(fit.dof - 2, trials):
+            changed[worst] = False
+        if (changed == kept).all() or changed.tobytes() in seen:
+            break
+        seen.add(kept.tobytes())
+        kept = changed
+    return CleanFit(fit, kept)
+
+
+def _sorted_robustly(view: View, plain: CameraFit, free: tuple[str, ...]) -> BoolArray:
+    """Keep the points that a robust fit explains: the better of two starts."""
+    starts = [affine_starts(view)[0]]
+    if isinstance(plain.camera.distortion, BrownIdeal):
+        starts.append(plain.camera)
+    best = np.inf
+    kept = np.ones(len(view), dtype=bool)
+    for start in starts:
+        try:
+            square = _robust_squares(view, free, start)
+        except GeometryError:
+            continue
+        variance = max(_inner_variance(square, view.xy_px.size - len(free)), ROUNDING_PX**2)
+        if variance < best:
+            best, kept = variance, np.asarray(square <= ROBUST_LIMIT * variance)
+    return kept
+
+
+def _robust_squares(view: View, free: tuple[str, ...], start: Camera) -> FloatArray:
+    """Squared whitened residuals of a fit by reweighting: Cauchy's weights, then Geman-McClure's.
+
+    Cauchy's pull every point a little, so that the search does not stick; the others forget a
+    blunder altogether.
+    """
+    camera, early = start, REWEIGHTINGS // 3
+    square = _squares(view, camera)
+    for step in range(REWEIGHTINGS):
+        stage = strong_parameters(free) if step < early else free
+        variance = max(_inner_variance(square, view.xy_px.size - len(stage)), ROUNDING_PX**2)
+        if not np.isfinite(variance):
+            raise GeometryError(f"camera {view.name!r}: the points do not belong to one view")
+        # four variances: a Gaussian residual keeps most of its weight
+        weight = 1 / (1 + square / (4 * variance)) ** (1 if step < early else 2)
+        fit = fit_camera(
+            _reweighted(view, weight), stage, camera, max_iterations=STEPS_PER_REWEIGHTING
+        )
+        camera = fit.camera
+        square = _squares(view, camera)
+    return square
+
+
+def _squares(view: View, camera: Camera) -> FloatArray:
+    residual = view.xy_px - camera.project(view.xyz_mm)
+    white, _ = whiten(view.whitener, residual.T, np.zeros((0, 2, len(view))))
+    return np.nan_to_num(np.sum(white**2, axis=0), nan=np.inf)
+
+
+def _reweighted(view: View, weight: FloatArray) -> View:
+    root = np.sqrt(weight)[:, None]
+    unit = np.array([1.0, 0.0, 1.0]) if view.whitener is None else view.whitener
+    return view.weighted(unit * root)
+
+
+def _noise(fit: CameraFit) -> float:
+    return float(np.sqrt(fit.chi_square / fit.dof))
+
+
+def _inner_noise(whitened: FloatArray, dof: int) -> float:
+    return float(np.sqrt(_inner_variance(np.sum(whitened**2, axis=1), dof)))
+
+
+def _inner_variance(square: FloatArray, dof: int) -> float:
+    """Variance of one coordinate by the median: squares of two Gaussians are exponential."""
+    return float(np.median(square) / (2 * np.log(2)) * 2 * len(square) / max(dof, 1))
+
+
+def _floor(fit: CameraFit) -> float:
+    """Variance of rounding in whitened units."""
+    scale = np.sum(fit.whitened**2) / max(np.sum(fit.residual_px**2), np.finfo(float).tiny)
+    return float(ROUNDING_PX**2 * (scale if scale > 0 else 1.0))

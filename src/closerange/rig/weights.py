@@ -1,0 +1,162 @@
+"""How the points of a calibration are weighed, and what their uncertainty makes of the cameras'.
+
+A point's covariance in the image is ``C_i + tau^2 I + std_i^2 J_i J_i'``: what detection states,
+a common part that it does not know (lens, print, sensor), and the control position's own error
+seen through the camera (J_i = d px / d mm). tau is one number for the whole rig: a camera of nine
+points has four degrees of freedom, too few for a variance of its own.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from closerange.geometry.arrays import BoolArray, FloatArray, IntArray
+from closerange.rig.camera import Camera
+from closerange.rig.camera_fit import CameraFit
+from closerange.rig.view import View, whiten
+
+_HALVINGS = 60  # float64 has 52 binary digits
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Stated:
+    """What is known of one camera's points before the fit; N points.
+
+    Attributes
+    ----------
+    cov_px2 : ndarray, shape (N, 2, 2)
+        Covariances in the image; 0 where nothing is known.
+    std_mm : ndarray, shape (N,)
+        Standard deviations of the control positions.
+    control_row : ndarray of int, shape (N,)
+        Which points share a control position, also among cameras.
+    """
+
+    cov_px2: FloatArray
+    std_mm: FloatArray
+    control_row: IntArray
+
+    @property
+    def any(self) -> bool:
+        """Whether anything is stated that makes weights unequal."""
+        return bool(self.cov_px2.any() or self.std_mm.any())
+
+    def select(self, rows: BoolArray) -> Stated:
+        """Keep some points."""
+        return Stated(self.cov_px2[rows], self.std_mm[rows], self.control_row[rows])
+
+    def in_image(self, camera: Camera, xyz_mm: FloatArray) -> FloatArray:
+        """Return the stated part of the covariances, shape (N, 2, 2), px^2."""
+        if not self.std_mm.any():
+            return self.cov_px2
+        by_world = camera.project_jacobian(xyz_mm)
+        spread = by_world * self.std_mm[:, None, None]
+        cov: FloatArray = self.cov_px2 + spread @ np.swapaxes(spread, 1, 2)
+        return cov
+
+
+def common_variance(residual_px: FloatArray, cov_px2: FloatArray, dof: int) -> float:
+    """Return tau^2 >= 0 that makes chi^2 equal to its degrees of freedom.
+
+    Parameters
+    ----------
+    residual_px : ndarray, shape (N, 2)
+        Of a fit.
+    cov_px2 : ndarray, shape (N, 2, 2)
+        Stated covariances; may be zero.
+    dof : int
+        Numbers minus parameters.
+
+    Returns
+    -------
+    float
+        px^2. Zero where the stated covariances explain the residuals alone, or overstate them:
+        they are then believed, which errs on the safe side. Without any, RSS / (n - p).
+
+    Notes
+    -----
+    The moment estimator of Mandel and Paule (doi:10.1021/ac60293a019).
+    """
+    values, vectors = np.linalg.eigh(cov_px2)
+    square = np.einsum("nij,ni->nj", vectors, residual_px) ** 2
+    values = np.maximum(values, 0.0)
+
+    def excess(tau2: float) -> float:
+        return float(np.sum(square / np.maximum(values + tau2, np.finfo(float).tiny))) - dof
+
+    low, high = 0.0, float(np.sum(square)) / dof
+    if high == 0 or excess(0.0) <= 0:
+        return 0.0
+    if not values.any():
+        return high
+    for _ in range(_HALVINGS):
+        middle = (low + high) / 2
+        low, high = (middle, high) if excess(middle) > 0 else (low, middle)
+    return high
+
+
+def whitener_of(cov_px2: FloatArray) -> FloatArray:
+    """Return the lower triangles (l11, l21, l22) of W with W C W' = I, shape (N, 3)."""
+    a = np.sqrt(cov_px2[:, 0, 0])
+    b = cov_px2[:, 1, 0] / a
+    c = np.sqrt(np.maximum(cov_px2[:, 1, 1] - b * b, np.finfo(float).tiny))
+    return np.stack([1 / a, -b / (a * c), 1 / c], axis=1)
+
+
+def parameter_covariance(
+    fits: Sequence[CameraFit], views: Sequence[View], stated: Sequence[Stated], variance: float
+) -> FloatArray:
+    """Return the covariance of all cameras' parameters.
+
+    Parameters
+    ----------
+    fits : sequence of CameraFit
+        One a camera.
+    views : sequence of View
+        The points that were fitted, with their whiteners.
+    stated : sequence of Stated
+        What was known of them.
+    variance : float
+        Of whitened residuals: 1 where they are true standard deviations, else s^2.
+
+    Returns
+    -------
+    ndarray, shape (P, P)
+        Blocks of the cameras on the diagonal. An error of a control position displaces its
+        images in all cameras and readings together; that correlation fills the other blocks
+        (the sandwich ``A cov(observations) A'`` with A the estimator's linear map).
+    """
+    offsets = np.cumsum([0, *(len(fit.free) for fit in fits)])
+    total = np.zeros((offsets[-1], offsets[-1]))
+    for fit, start in zip(fits, offsets, strict=False):
+        block = slice(start, start + len(fit.free))
+        total[block, block] = variance * fit.cofactor
+    if not any(part.std_mm.any() for part in stated):
+        return total
+    rows = np.concatenate([part.control_row for part in stated])
+    std = np.concatenate([part.std_mm for part in stated])
+    pull = np.zeros((len(rows), offsets[-1], 3))
+    done = 0
+    for fit, view, start in zip(fits, views, offsets, strict=False):
+        pull[done : done + len(view), start : start + len(fit.free)] = _pull(fit, view)
+        done += len(view)
+    pull *= std[:, None, None]
+    _, group = np.unique(rows, return_inverse=True)
+    together = np.zeros((group.max() + 1, *pull.shape[1:]))
+    np.add.at(together, group, pull)
+    total += np.tensordot(together, together, axes=([0, 2], [0, 2]))
+    # each point's own share is in the cofactor already
+    total -= np.tensordot(pull, pull, axes=([0, 2], [0, 2]))
+    return total
+
+
+def _pull(fit: CameraFit, view: View) -> FloatArray:
+    """D parameters / d control mm of each point, shape (N, p, 3)."""
+    by_world = np.moveaxis(fit.camera.project_jacobian(view.xyz_mm), 0, 2)  # (2, 3, N)
+    _, white = whiten(view.whitener, np.zeros((2, len(view))), by_world.swapaxes(0, 1))
+    moment = np.einsum("nip,kin->npk", fit.orthonormal, white)
+    pull: FloatArray = np.einsum("qp,npk->nqk", fit.root, moment)
+    return pull

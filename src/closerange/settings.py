@@ -1,0 +1,256 @@
+"""The project file ``closerange.toml``: one whole job, as frozen settings.
+
+Paths are relative to the project file and stay inside its folder. ::
+
+    schema = "closerange.project/1"
+    title = "Plate at seven heights"
+
+    [calibration]
+    target = "plate.toml"
+    control = "control.csv"
+    placement_pattern = "z(.*)$"
+    images = { left = ["calibration/left_*.png"], right = ["calibration/right_*.png"] }
+
+    [[job]]
+    name = "single-point"
+    target = "disc.toml"
+    placement_pattern = "p(?P<placement>[0-9]+)_(left|right)_r(?P<reading>[0-9]+)$"
+    images = { left = ["verify/*_left_*.png"], right = ["verify/*_right_*.png"] }
+    crops = "verify/crops.csv"
+    verify = "single-point"
+    truth = "verify/truth.csv"
+"""
+
+from __future__ import annotations
+
+import tomllib
+from pathlib import Path
+from typing import Annotated, Literal
+
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+
+from closerange.errors import FileError, SchemaError
+from closerange.files import read_text
+
+SCHEMA = "closerange.project/1"
+
+Name = Annotated[str, Field(min_length=1)]
+Estimator = Literal["least-squares", "border-centroid"]
+
+
+class _Table(BaseModel):
+    """A table of the project file: frozen, without unknown keys."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid", strict=True)
+
+
+class Detection(_Table):
+    """What to look for in which images.
+
+    Attributes
+    ----------
+    target : str
+        Target file.
+    images : dict of str to list of str
+        Camera name: glob patterns of its image files.
+    placement_pattern : str or None
+        How a file name gives the placement and the reading; see `closerange detect`.
+    crops : str or None
+        CSV file with ``image, x0_px, y0_px`` for images cut out of larger ones.
+    estimator : str
+        ``least-squares`` or ``border-centroid``.
+    """
+
+    target: Name
+    images: dict[Name, list[Name]]
+    placement_pattern: str | None = None
+    crops: Name | None = None
+    estimator: Estimator = "least-squares"
+
+
+class Calibration(Detection):
+    """How the rig is calibrated.
+
+    Attributes
+    ----------
+    control : str
+        Control table.
+    model : str
+        As ``closerange calibrate --model``.
+    volume_mm : list of float or None
+        Six numbers: lower corner, upper corner.
+    accept_untrusted : bool
+        Go on with an untrustworthy rig, marked so.
+    """
+
+    control: Name
+    model: Name = "auto"
+    volume_mm: Annotated[list[float], Field(min_length=6, max_length=6)] | None = None
+    accept_untrusted: bool = False
+
+
+class Job(Detection):
+    """Something to measure and, if a truth is known, to verify.
+
+    Attributes
+    ----------
+    name : str
+        Names its output files.
+    verify : str or None
+        ``control``, ``single-point`` or ``lengths``.
+    truth : str or None
+        Table of true positions or lengths.
+    """
+
+    name: Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9 ._-]*$")]
+    verify: Literal["control", "single-point", "lengths"] | None = None
+    truth: Name | None = None
+
+    @model_validator(mode="after")
+    def _verify_needs_truth(self) -> Job:
+        if (self.verify is None) != (self.truth is None):
+            raise ValueError("verify and truth go together")
+        return self
+
+
+class Outputs(_Table):
+    """Where results go.
+
+    Attributes
+    ----------
+    folder : str
+        Created by the run; an existing one is only replaced when told so.
+    """
+
+    folder: Name = "results"
+
+
+class Settings(_Table):
+    """A project file.
+
+    Attributes
+    ----------
+    folder : Path
+        Folder of the project file.
+    schema_ : str
+        ``closerange.project/1``, written as ``schema``.
+    title : str
+        For reports.
+    calibration : Calibration
+        How the rig is calibrated.
+    job : list of Job
+        What is measured.
+    outputs : Outputs
+        Where results go.
+    """
+
+    folder: Path
+    schema_: Literal["closerange.project/1"] = Field(alias="schema")
+    title: Name = "Close-range measurement"
+    calibration: Calibration
+    job: list[Job] = []
+    outputs: Outputs = Outputs()
+
+
+def read_settings(path: Path | str) -> Settings:
+    """Read a project file.
+
+    Parameters
+    ----------
+    path : Path or str
+        TOML file.
+
+    Returns
+    -------
+    Settings
+        Checked, except that its files exist.
+
+    Raises
+    ------
+    FileError
+        If the file cannot be read.
+    SchemaError
+        If it is not TOML, or a key is unknown, missing or of the wrong kind.
+    """
+    path = Path(path)
+    try:
+        document = tomllib.loads(read_text(path))
+    except tomllib.TOMLDecodeError as error:
+        raise SchemaError(f"{path}: {error}", remedy="correct the TOML") from error
+    except RecursionError as error:
+        raise SchemaError(f"{path}: nested too deeply", remedy="this is no project file") from error
+    if "folder" in document:
+        raise SchemaError(f"{path}: folder: unknown key", remedy="remove it")
+    try:
+        return Settings.model_validate({**document, "folder": path.parent})
+    except ValidationError as error:
+        first = error.errors()[0]
+        where = ".".join(str(part) for part in first["loc"]) or "project"
+        raise SchemaError(
+            f"{path}: {where}: {first['msg']}", remedy="see 'Project file' in the documentation"
+        ) from error
+
+
+def inside(settings: Settings, relative: str) -> Path:
+    """Resolve a path of the project file.
+
+    Parameters
+    ----------
+    settings : Settings
+        The project.
+    relative : str
+        Path as written.
+
+    Returns
+    -------
+    Path
+        The file below the project's folder.
+
+    Raises
+    ------
+    FileError
+        If it is absolute, climbs out of the folder, or leaves it through a symbolic link.
+    """
+    written = Path(relative)
+    if written.is_absolute() or ".." in written.parts:
+        raise FileError(
+            f"{relative}: leaves the project's folder", remedy="put the file below the project file"
+        )
+    path = settings.folder / written
+    root = settings.folder.resolve()
+    if not path.resolve().is_relative_to(root):
+        raise FileError(
+            f"{relative}: a symbolic link leaves the project's folder",
+            remedy="put the file itself below the project file",
+        )
+    return path
+
+
+def images_of(settings: Settings, patterns: list[str]) -> list[Path]:
+    """Find the image files of glob patterns, in natural order by the caller.
+
+    Parameters
+    ----------
+    settings : Settings
+        The project.
+    patterns : list of str
+        File names, or patterns with ``*`` and ``?`` in their last part.
+
+    Returns
+    -------
+    list of Path
+        Existing files.
+
+    Raises
+    ------
+    FileError
+        If a pattern finds nothing or leaves the project's folder.
+    """
+    found: list[Path] = []
+    for pattern in patterns:
+        folder = inside(settings, str(Path(pattern).parent))
+        matches = sorted(folder.glob(Path(pattern).name)) if folder.is_dir() else []
+        if not matches:
+            raise FileError(f"{pattern}: no such file in the project", remedy="correct the pattern")
+        found.extend(inside(settings, str(match.relative_to(settings.folder))) for match in matches)
+    return found

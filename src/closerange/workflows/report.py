@@ -1,0 +1,106 @@
+"""The verb `report`: any stored result becomes one self-contained HTML file."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from closerange.delivery.overlays import Overlay
+from closerange.delivery.report import render_report
+from closerange.errors import SchemaError
+from closerange.files import MAX_TABLE_BYTES, load_json
+from closerange.rig.rig import Rig
+from closerange.rig.rig_file import rig_from_document
+from closerange.rig.rig_schema import SCHEMA as RIG_SCHEMA
+from closerange.verification.error_map import ErrorMap, judged_volume, predict_errors
+from closerange.verification.result_file import SCHEMA as RESULT_SCHEMA
+from closerange.verification.result_file import read_result
+
+RUN_SCHEMA = "closerange.run/1"
+
+_TITLES = {
+    "control": "Comparison with control points",
+    "single-point": "Single-point test",
+    "lengths": "Length test",
+}
+
+
+def report(source: Path | str) -> str:
+    """Render a stored result again.
+
+    Parameters
+    ----------
+    source : Path or str
+        A rig file, a verification result, or the ``run.json`` of a project.
+
+    Returns
+    -------
+    str
+        HTML that needs no other file and no network.
+
+    Raises
+    ------
+    FileError
+        If the file cannot be read.
+    SchemaError
+        If it is none of our files.
+    """
+    document = load_json(source, max_bytes=MAX_TABLE_BYTES)
+    schema = document.get("schema") if isinstance(document, dict) else None
+    if schema == RIG_SCHEMA:
+        return report_of_rig(rig_from_document(document, source=str(source)))
+    if schema == RESULT_SCHEMA:
+        return report_of_result(read_result(source))
+    if schema == RUN_SCHEMA:
+        return report_of_run(document, source=str(source))
+    raise SchemaError(
+        f"{source}: schema is {schema!r}; no stored result",
+        remedy="name a rig file, a verification result or a run.json",
+    )
+
+
+def report_of_rig(rig: Rig) -> str:
+    """Render a calibration."""
+    return render_report(
+        title="Calibration",
+        rig=rig,
+        error_map=error_map_of(rig),
+        provenance=rig.provenance,
+    )
+
+
+def report_of_result(document: Mapping[str, Any]) -> str:
+    """Render a verification result."""
+    return render_report(
+        title=_TITLES[document["kind"]],
+        checks=[document],
+        provenance=document.get("provenance") or {},
+    )
+
+
+def report_of_run(document: Mapping[str, Any], *, source: str) -> str:
+    """Render what a project gave, from its ``run.json``."""
+    try:
+        rig = rig_from_document(document["rig"], source=source)
+        overlays = [Overlay.from_document(entry) for entry in document["overlays"]]
+        return render_report(
+            title=document["title"],
+            rig=rig,
+            overlays=overlays,
+            checks=document["results"],
+            error_map=error_map_of(rig),
+            provenance=document["provenance"],
+            notes=document["warnings"],
+        )
+    except (KeyError, TypeError, AttributeError) as error:
+        raise SchemaError(
+            f"{source}: not a complete run ({error})", remedy="run the project again"
+        ) from error
+
+
+def error_map_of(rig: Rig) -> ErrorMap | None:
+    """Predict the error in the volume; None for a single camera, which measures no position."""
+    if len(rig.cameras) < 2:
+        return None
+    return predict_errors(rig, judged_volume(rig.volume_mm))

@@ -1,0 +1,101 @@
+"""The verb `verify`: positions are compared with a known truth."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from closerange.errors import InputError
+from closerange.features.control import ControlPoints, read_control
+from closerange.position.positions import Positions
+from closerange.position.positions_table import read_positions
+from closerange.rig.rig import Rig
+from closerange.rig.rig_file import read_rig
+from closerange.verification.acceptance import AcceptanceReport, Limits
+from closerange.verification.control_check import ControlCheck, compare_with_control
+from closerange.verification.lengths import LengthCheck, Lengths, length_test, read_lengths
+from closerange.verification.single_point import single_point_test
+
+KINDS = ("control", "single-point", "lengths")
+
+Result = ControlCheck | AcceptanceReport | LengthCheck
+
+
+def verify(
+    kind: str,
+    positions: Positions | Path | str,
+    *,
+    truth: ControlPoints | Lengths | Path | str,
+    rig: Rig | Path | str | None = None,
+    limits: Limits | None = None,
+    cycle_time_s: float | None = None,
+) -> Result:
+    """Compare measured positions with a known truth.
+
+    Parameters
+    ----------
+    kind : str
+        ``control`` (tables and averages for control points), ``single-point`` (accuracy and
+        repeatability by repeated readings, chapter 3) or ``lengths`` (known distances).
+    positions : Positions or path
+        What was measured, or its table.
+    truth : ControlPoints, Lengths or path
+        True positions (control table) or true lengths (``point_a, point_b, length_mm``).
+    rig : Rig or path, optional
+        With it, `control` tells fitted from check points and inside from outside the volume.
+    limits : Limits, optional
+        Permissible errors; with them `single-point` decides.
+    cycle_time_s : float, optional
+        Time from the command to the result, for `single-point`.
+
+    Returns
+    -------
+    ControlCheck, AcceptanceReport or LengthCheck
+        What was found; each has `to_document`.
+
+    Raises
+    ------
+    InputError
+        If a file, the kind or the truth cannot be used.
+    DataError
+        If no measured position has a truth.
+    """
+    if not isinstance(positions, Positions):
+        positions = read_positions(positions)
+    if kind == "lengths":
+        return length_test(positions, _lengths(truth))
+    control = _control(truth)
+    if kind == "single-point":
+        return single_point_test(
+            positions,
+            control,
+            limits=limits,
+            cycle_time_s=cycle_time_s,
+            noise_cov_mm2=positions.image_cov_mm2,
+        )
+    if kind == "control":
+        return _control_check(positions, control, rig)
+    raise InputError(f"kind {kind!r} of verification", remedy=f"known kinds are {', '.join(KINDS)}")
+
+
+def _control_check(
+    positions: Positions, control: ControlPoints, rig: Rig | Path | str | None
+) -> ControlCheck:
+    if rig is None:
+        return compare_with_control(positions, control)
+    if not isinstance(rig, Rig):
+        rig = read_rig(rig)
+    rows = rig.residuals
+    fitted = {(rows.placement[i], rows.point[i]) for i in range(len(rows)) if bool(rows.fitted[i])}
+    return compare_with_control(positions, control, fitted=fitted, volume_mm=rig.volume_mm)
+
+
+def _control(truth: ControlPoints | Lengths | Path | str) -> ControlPoints:
+    if isinstance(truth, Lengths):
+        raise InputError("true lengths given", remedy="this kind compares with true positions")
+    return truth if isinstance(truth, ControlPoints) else read_control(truth)
+
+
+def _lengths(truth: ControlPoints | Lengths | Path | str) -> Lengths:
+    if isinstance(truth, ControlPoints):
+        raise InputError("true positions given", remedy="the kind lengths compares with lengths")
+    return truth if isinstance(truth, Lengths) else read_lengths(truth)
