@@ -96,6 +96,19 @@ def public_names() -> str:
     return "\n".join([*blocks, "```"])
 
 
+def escape_bars(_app, _what, _name, _obj, _options, lines):
+    """Let |x| in docstrings be a magnitude and not a substitution of reStructuredText."""
+    for row, line in enumerate(lines):
+        parts = line.split("``")
+        parts[::2] = [part.replace("|", "\\|") for part in parts[::2]]
+        lines[row] = "``".join(parts)
+
+
+def setup(app):
+    """Connect the docstring filter."""
+    app.connect("autodoc-process-docstring", escape_bars, priority=100)
+
+
 myst_substitutions = {
     "flags_table": flags_table(),
     "public_names": public_names(),

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from typing import Any
+
 import numpy as np
 
 from closerange.delivery.excerpts import shown
@@ -9,7 +12,7 @@ from closerange.delivery.facts import fact_blocks
 from closerange.delivery.layout3d import Group, draw_layout, draw_points, paper_up
 from closerange.delivery.plots import magnification, vector_plot
 from closerange.delivery.sheet import Block, Contents, Figure, Paragraph, Section, Table
-from closerange.delivery.svg import BLUE, GREEN, VERMILION
+from closerange.delivery.svg import BLUE, FULL_WIDTH, GREEN, VERMILION
 from closerange.delivery.wording import (
     DASH,
     FLAG_WORDS,
@@ -28,17 +31,17 @@ _PARAMETERS = {
     "cx": ("principal point x", "px"),
     "cy": ("principal point y", "px"),
     "skew": ("skew", "px"),
-    "k1": ("radial distortion k1", "none"),
-    "k2": ("radial distortion k2", "none"),
-    "k3": ("radial distortion k3", "none"),
-    "p1": ("decentring p1", "none"),
-    "p2": ("decentring p2", "none"),
-    "rx": ("small turn about the camera's x", "rad"),
-    "ry": ("small turn about the camera's y", "rad"),
-    "rz": ("small turn about the camera's z", "rad"),
-    "tx": ("translation along the camera's x", "mm"),
-    "ty": ("translation along the camera's y", "mm"),
-    "tz": ("translation along the camera's z", "mm"),
+    "k1": ("radial distortion k1", "pure\u00a0number"),
+    "k2": ("radial distortion k2", "pure\u00a0number"),
+    "k3": ("radial distortion k3", "pure\u00a0number"),
+    "p1": ("decentring p1", "pure\u00a0number"),
+    "p2": ("decentring p2", "pure\u00a0number"),
+    "rx": ("small turn about x", "rad"),
+    "ry": ("small turn about y", "rad"),
+    "rz": ("small turn about z", "rad"),
+    "tx": ("translation along x", "mm"),
+    "ty": ("translation along y", "mm"),
+    "tz": ("translation along z", "mm"),
 }
 
 
@@ -61,9 +64,10 @@ def calibration_section(contents: Contents) -> Section | None:
     blocks: list[Block] = [*_trust(rig)]
     blocks.append(
         Figure(
-            draw_layout(rig),
+            draw_layout(rig, width=FULL_WIDTH / 2),
             "Cameras and measuring volume in parallel projection, axes in mm; dashed: "
             "optical axes.",
+            half=True,
         )
     )
     if len(rig.residuals):
@@ -73,7 +77,7 @@ def calibration_section(contents: Contents) -> Section | None:
         blocks += _left_out_points(rig.residuals)
     if rig.parameters:
         blocks.append(_parameter_table(rig))
-    blocks += fact_blocks("How the model was chosen and what was fixed", rig.report)
+    blocks += fact_blocks("How it was calculated and what was fixed", _other_facts(rig.report))
     return Section("calibration", "Calibration", tuple(blocks))
 
 
@@ -99,8 +103,8 @@ def _points_figure(rig: Rig) -> Figure:
     xyz = residuals.xyz_mm
     groups = [
         Group("fitted", _unique(xyz[residuals.fitted]), (BLUE,)),
-        Group("check point: not fitted", _unique(xyz[check]), (GREEN,)),
-        Group("outlier: left out", _unique(xyz[outlier]), (VERMILION,)),
+        Group("check point", _unique(xyz[check]), (GREEN,)),
+        Group("outlier", _unique(xyz[outlier]), (VERMILION,)),
     ]
     title = "Control points in the measuring volume"
     picture = draw_points(
@@ -110,7 +114,7 @@ def _points_figure(rig: Rig) -> Figure:
         title=title,
         description=f"{len(_unique(xyz))} places",
     )
-    return Figure(picture, f"{title} (box), axes in mm; thin lines lead down to the floor.")
+    return Figure(picture, f"{title} (box), axes in mm; thin lines lead to the floor.", half=True)
 
 
 def _unique(xyz_mm: FloatArray) -> FloatArray:
@@ -190,7 +194,7 @@ def _left_out_points(residuals: Residuals) -> list[Block]:
 
 def _parameter_table(rig: Rig) -> Table:
     std = np.sqrt(np.clip(np.diag(rig.parameter_cov), 0, None))
-    rows = []
+    rows: list[tuple[str, ...]] = []
     for camera in rig.cameras:
         names, places = rig.parameters_of(camera.name)
         for name, place in zip(names, places, strict=True):
@@ -199,10 +203,45 @@ def _parameter_table(rig: Rig) -> Table:
             value = (
                 DASH if name in ("rx", "ry", "rz") else _value(rig, camera.name, name, std[place])
             )
-            rows.append((camera.name, words, name, value, significant(float(std[place]), 2), unit))
-    head = ("camera", "parameter", "symbol", "value", "standard deviation", "unit")
-    caption = "Free parameters (rotations are small turns after the stored attitude, hence 0)"
-    return Table(caption, head, rows, texts=frozenset({0, 1, 2, 5}))
+            spread = significant(float(std[place]), 2)
+            rows.append((camera.name, words, name, value, spread, unit, "free"))
+        rows += _fixed_rows(camera.name, rig.report)
+    head = ("camera", "parameter", "symbol", "value", "standard deviation", "unit", "free or fixed")
+    caption = "Parameters (turns and translations in the camera's axes; turns have no value)"
+    return Table(caption, head, rows, texts=frozenset({0, 1, 2, 5, 6}), wide=True)
+
+
+def _fixed_rows(camera: str, report: Mapping[str, Any]) -> list[tuple[str, ...]]:
+    """List what was not estimated, and why, where the calibration says so."""
+    rows: list[tuple[str, ...]] = []
+    for name, fact in _facts_of(camera, report).items():
+        if isinstance(fact, Mapping) and fact.get("free") is False:
+            words, unit = _PARAMETERS.get(name, (name, DASH))
+            value = significant(float(fact.get("value") or 0.0), 6)
+            rows.append((camera, words, name, value, DASH, unit, f"fixed: {fact.get('why', '')}"))
+    return rows
+
+
+def _facts_of(camera: str, report: Mapping[str, Any]) -> Mapping[str, Any]:
+    """Return what a calibration's report says of the parameters of a camera."""
+    found: Any = report
+    for key in ("cameras", camera, "parameters"):
+        found = found.get(key) if isinstance(found, Mapping) else None
+    return found if isinstance(found, Mapping) else {}
+
+
+def _other_facts(report: Mapping[str, Any]) -> dict[str, Any]:
+    """Leave out of a report what the table of parameters shows."""
+    facts = dict(report)
+    cameras = facts.get("cameras")
+    if isinstance(cameras, Mapping):
+        facts["cameras"] = {
+            name: {key: value for key, value in fact.items() if key != "parameters"}
+            if isinstance(fact, Mapping)
+            else fact
+            for name, fact in cameras.items()
+        }
+    return facts
 
 
 def _value(rig: Rig, camera: str, name: str, std: float) -> str:

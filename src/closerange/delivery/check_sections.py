@@ -5,12 +5,15 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping
 from typing import Any
 
-from closerange.delivery.excerpts import coverage_text, four, left_out, listed, numbers, shown
+import numpy as np
+
+from closerange.delivery.excerpts import four, left_out, listed, numbers, shown
 from closerange.delivery.plots import Level, Panel, panel_grid
-from closerange.delivery.sheet import Block, Figure, Paragraph, Section, Table, Terms
+from closerange.delivery.sheet import Block, Figure, Paragraph, Section, Table
 from closerange.delivery.single_point_section import single_point_blocks
 from closerange.delivery.svg import AXIS_COLOURS, VERMILION
 from closerange.delivery.wording import (
+    DASH,
     counted,
     fixed,
     micrometres,
@@ -46,7 +49,8 @@ def check_sections(checks: Iterable[Mapping[str, Any]]) -> list[Section]:
         writer = writers.get(str(check.get("kind")))
         if writer is not None:
             title, blocks = writer(check)
-            sections.append(Section(f"check-{number}", title, tuple(blocks)))
+            job = f": {check['job']}" if check.get("job") else ""
+            sections.append(Section(f"check-{number}", title + job, tuple(blocks)))
     return sections
 
 
@@ -71,8 +75,7 @@ def _control(check: Mapping[str, Any]) -> tuple[str, list[Block]]:
             for key, group in groups.items()
         ]
         blocks.append(Table(caption, head, cells))
-    regions = [(_GROUPS.get(key, key), coverage_text(check["coverage"][key])) for key in groups]
-    blocks.append(Terms(tuple(regions)))
+    blocks.append(_regions(check["coverage"], groups))
     blocks += _control_figures(rows)
     blocks += _systematic(check["systematic"])
     blocks += left_out(check)
@@ -81,6 +84,32 @@ def _control(check: Mapping[str, Any]) -> tuple[str, list[Block]]:
         blocks.append(Paragraph(f"Control points without a measured position: {names}."))
     blocks.append(_control_rows(rows))
     return "Control points", blocks
+
+
+def _regions(coverage: Mapping[str, Any], groups: Iterable[str]) -> Table:
+    """Say for each group how many errors lie inside their stated regions."""
+    rows = []
+    for key in groups:
+        found = coverage[key]
+        share, low, high, ratio = (
+            float(numbers(found[name])) for name in ("share", "low", "high", "mean_ratio")
+        )
+        rows.append(
+            (
+                _GROUPS.get(key, key),
+                f"{found['inside']} of {found['count']}",
+                percent(share),
+                f"{percent(low)} to {percent(high)}" if np.isfinite(share) else DASH,
+                fixed(ratio, 2),
+            )
+        )
+    level = f"{100 * coverage['all']['level']:.0f} %"
+    head = (
+        *("group", "errors inside", "share [%]", "true share between [%]"),
+        "mean squared error / predicted",
+    )
+    caption = f"Errors inside their stated {level} region ({level} and a ratio of 1 are right)"
+    return Table(caption, head, rows)
 
 
 def _control_figures(rows: Mapping[str, Any]) -> list[Block]:
@@ -166,8 +195,7 @@ def _control_rows(rows: Mapping[str, Any]) -> Table:
 
 def _lengths(check: Mapping[str, Any]) -> tuple[str, list[Block]]:
     rows = check["rows"]
-    true, measured = (numbers(rows[name]) for name in ("true_mm", "measured_mm"))
-    error, predicted = (1000 * numbers(rows[name]) for name in ("error_mm", "predicted_std_mm"))
+    true, error = numbers(rows["true_mm"]), 1000 * numbers(rows["error_mm"])
     bias, rms, largest = (
         micrometres(float(numbers(check[name]))) for name in ("bias_mm", "rms_mm", "max_mm")
     )
@@ -189,6 +217,13 @@ def _lengths(check: Mapping[str, Any]) -> tuple[str, list[Block]]:
     )
     caption = "Error of each length (measured minus known) against its length."
     picture = panel_grid([panel], columns=1, height=190, title="Lengths", description=caption)
+    blocks: list[Block] = [Paragraph(text), Figure(picture, caption), _length_rows(rows)]
+    return "Lengths", blocks + left_out(check)
+
+
+def _length_rows(rows: Mapping[str, Any]) -> Table:
+    true, measured = (numbers(rows[name]) for name in ("true_mm", "measured_mm"))
+    error, predicted = (1000 * numbers(rows[name]) for name in ("error_mm", "predicted_std_mm"))
     names = ("placement", "reading", "point_a", "point_b")
     cells = [
         (
@@ -208,6 +243,4 @@ def _lengths(check: Mapping[str, Any]) -> tuple[str, list[Block]]:
     marked = frozenset(i for i, used in enumerate(rows["used"]) if not used)
     texts = frozenset({0, 1, 2, 3, len(head) - 1})
     title = "All lengths; marked rows are not averaged"
-    table = shown(cells, title, head, texts=texts, marked=marked, wide=True)
-    blocks: list[Block] = [Paragraph(text), Figure(picture, caption), table]
-    return "Lengths", blocks + left_out(check)
+    return shown(cells, title, head, texts=texts, marked=marked, wide=True)

@@ -14,12 +14,44 @@ from closerange.geometry.arrays import FloatArray
 MAX_ROWS = 200
 """Rows of a table that a report prints; the rest is in the CSV file."""
 
+TOO_SMALL = "region too small"
+"""Stated uncertainties that errors exceed by more than chance explains."""
+
 DECISIONS = {"accept": "accepted", "reject": "rejected", "undecided": "undecided"}
 
 
 def numbers(value: Any) -> FloatArray:
     """Read numbers of a document, in which null means "not known", as an array with NaN."""
     return np.array(value, dtype=np.float64)
+
+
+def documents_of(checks: Sequence[object]) -> tuple[Mapping[str, Any], ...]:
+    """Turn verification results into their documents; documents stay as they are.
+
+    Parameters
+    ----------
+    checks : sequence of object
+        Results with a `to_document` method, or mappings.
+
+    Returns
+    -------
+    tuple of mapping
+        In the same order.
+
+    Raises
+    ------
+    TypeError
+        If something is neither.
+    """
+    documents: list[Mapping[str, Any]] = []
+    for check in checks:
+        document = check if isinstance(check, Mapping) else None
+        if document is None and hasattr(check, "to_document"):
+            document = check.to_document()
+        if not isinstance(document, Mapping):
+            raise TypeError(f"{type(check).__name__} is not a verification result")
+        documents.append(document)
+    return tuple(documents)
 
 
 def shown(
@@ -31,6 +63,32 @@ def shown(
         caption = f"{caption} (first {MAX_ROWS} of {len(rows)} rows; for the others see the CSV)"
         style["marked"] = frozenset(row for row in style.get("marked", ()) if row < MAX_ROWS)
     return Table(caption, head, list(rows[:MAX_ROWS]), **style)
+
+
+def coverage_word(coverage: Mapping[str, Any]) -> str:
+    """Judge whether stated uncertainties hold.
+
+    Parameters
+    ----------
+    coverage : mapping
+        Document of a `Coverage`.
+
+    Returns
+    -------
+    str
+        ``holds``, ``region too small``, ``cautious`` or a dash where nothing is known.
+    """
+    level = float(coverage["level"])
+    share, low, high, ratio = (
+        float(numbers(coverage[name])) for name in ("share", "low", "high", "mean_ratio")
+    )
+    if not np.isfinite(share):
+        return DASH
+    # The interval takes errors as independent, but they share one calibration, whose luck alone
+    # moves the ratio: with ten effective parameters it stays below 2 in 97 of 100 calibrations.
+    if high < level and ratio > 2:
+        return TOO_SMALL
+    return "cautious" if low > level else "holds"
 
 
 def coverage_text(coverage: Mapping[str, Any]) -> str:

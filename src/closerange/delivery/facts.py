@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
 from closerange.delivery.excerpts import shown
@@ -52,14 +52,19 @@ def fact_blocks(caption: str, facts: Mapping[str, Any]) -> list[Block]:
         if _is_hashes(value):
             rows = [(str(name), str(digest)) for name, digest in value.items()]
             head = ("file", "SHA-256")
-            tables.append(Table(words(path), head, rows, texts=frozenset({0, 1}), wide=True))
+            tables.append(
+                Table(words(path), head, rows, texts=frozenset({0, 1}), dense=True, breakable=True)
+            )
+        elif isinstance(value, Mapping):
+            rows_of = [{"name": name, **item} for name, item in value.items()]
+            tables.append(_rows_table(words(path), rows_of))
         elif _is_rows(value):
             tables.append(_rows_table(words(path), value))
         else:
             singles.append((words(path), _text(value)))
     if singles:
         head = ("name", "value")
-        tables.insert(0, shown(singles, caption, head, texts=frozenset({0, 1})))
+        tables.insert(0, shown(singles, caption, head, texts=frozenset({0, 1}), breakable=True))
     return tables
 
 
@@ -73,10 +78,10 @@ def words(name: str) -> str:
 
 def _walk(path: str, value: Any) -> Iterator[tuple[str, Any]]:
     """Yield (path, value) of everything that is not a plain mapping."""
-    if isinstance(value, Mapping) and not _is_hashes(value):
+    if isinstance(value, Mapping) and not (_is_hashes(value) or _is_named_rows(value)):
         for key, item in value.items():
             yield from _walk(f"{path}: {key}" if path else str(key), item)
-    elif value not in (None, "", [], ()):
+    elif value not in (None, "", [], (), {}):
         yield path, value
 
 
@@ -88,6 +93,15 @@ def _is_hashes(value: Any) -> bool:
     )
 
 
+def _is_named_rows(value: Mapping[str, Any]) -> bool:
+    """Tell whether a mapping holds several flat mappings with the same names."""
+    items = list(value.values())
+    if len(items) < 2 or not all(isinstance(item, Mapping) and item for item in items):
+        return False
+    flat = not any(isinstance(cell, Mapping) for item in items for cell in item.values())
+    return flat and all(item.keys() == items[0].keys() for item in items)
+
+
 def _is_rows(value: Any) -> bool:
     return (
         isinstance(value, list | tuple)
@@ -96,7 +110,7 @@ def _is_rows(value: Any) -> bool:
     )
 
 
-def _rows_table(caption: str, rows: list[Mapping[str, Any]]) -> Table:
+def _rows_table(caption: str, rows: Sequence[Mapping[str, Any]]) -> Table:
     names = list(dict.fromkeys(str(key) for row in rows for key in row))
     cells = [[_text(row.get(name)) for name in names] for row in rows]
     texts = frozenset(

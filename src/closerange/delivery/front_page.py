@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 
-from closerange.delivery.excerpts import DECISIONS, numbers
+from closerange.delivery.excerpts import DECISIONS, TOO_SMALL, coverage_word, numbers
 from closerange.delivery.layout3d import draw_layout, draw_values, paper_up
 from closerange.delivery.overlays import draw_overlay
 from closerange.delivery.sheet import Contents, Figure, Table
@@ -61,6 +61,7 @@ def verdict(contents: Contents) -> Verdict:
         calibration's own prediction, counts.
     """
     found = _from_checks(contents) or _from_rig(contents.rig) or _from_counts(contents)
+    found = _with_coverage(found, contents)
     if contents.rig is not None and not contents.rig.trusted and found.tone != "bad":
         warning = "the calibration was accepted although untrustworthy"
         found = Verdict(f"Not to be relied upon, {warning}: {found.text}", "bad")
@@ -83,17 +84,17 @@ def figures_table(contents: Contents) -> Table | None:
     """
     rows: list[tuple[str, ...]] = []
     for check in contents.checks_of("single-point"):
-        rows += _single_point_rows(check)
+        rows += _of_job(_single_point_rows(check), check)
     for check in contents.checks_of("control"):
-        rows += _control_rows(check)
+        rows += _of_job(_control_rows(check), check)
     for check in contents.checks_of("lengths"):
-        rows += _length_rows(check)
+        rows += _of_job(_length_rows(check), check)
     if contents.rig is not None:
         rows += _rig_rows(contents.rig)
     if not rows:
         return None
     head = ("figure", "X", "Y", "Z", "unit", "uncertainty", "limit", "decision")
-    bad = frozenset(i for i, row in enumerate(rows) if row[-1] == DECISIONS["reject"])
+    bad = frozenset(i for i, row in enumerate(rows) if row[-1] in (DECISIONS["reject"], TOO_SMALL))
     return Table("Figures", head, rows, texts=frozenset({0, 4, 5, 6, 7}), marked=bad)
 
 
@@ -129,8 +130,28 @@ def front_picture(contents: Contents) -> Figure | None:
         )
     if contents.overlays:
         first = contents.overlays[0]
-        return Figure(draw_overlay(first), f"What was detected in {first.source or first.camera}.")
+        name = first.file_name or f"the image of camera {first.camera}"
+        return Figure(
+            draw_overlay(replace(first, residual_px=first.residual_px * np.nan)),
+            f"What was detected in {name}.",
+        )
     return None
+
+
+def _with_coverage(found: Verdict, contents: Contents) -> Verdict:
+    """Say in the same sentence if the stated uncertainties do not hold."""
+    for check in (*contents.checks_of("single-point"), *contents.checks_of("control")):
+        coverage = check["coverage"]
+        if check["kind"] == "control":
+            coverage = coverage[_proving_group(check)[0]]
+        if coverage_word(coverage) == TOO_SMALL:
+            level, share = f"{100 * coverage['level']:.0f} %", float(numbers(coverage["share"]))
+            text = (
+                f"{found.text.removesuffix('.')}; but the stated uncertainties are too small: "
+                f"{percent(share)} of the errors lie in their {level} region."
+            )
+            return Verdict(text, "bad" if found.tone == "bad" else "warn")
+    return found
 
 
 def _from_checks(contents: Contents) -> Verdict | None:
@@ -214,6 +235,12 @@ def _from_counts(contents: Contents) -> Verdict:
     return Verdict("Nothing was measured.")
 
 
+def _of_job(rows: list[tuple[str, ...]], check: Mapping[str, Any]) -> list[tuple[str, ...]]:
+    """Add the name of the job to figures, where a result has one."""
+    job = check.get("job")
+    return [(f"{row[0]}, {job}", *row[1:]) for row in rows] if job else rows
+
+
 def _single_point_rows(check: Mapping[str, Any]) -> list[tuple[str, ...]]:
     limits = check["limits"] or {}
     pooled = check["repeatability"]["pooled"]
@@ -286,7 +313,8 @@ def _coverage_rows(coverage: Mapping[str, Any]) -> list[tuple[str, ...]]:
     level = f"{100 * coverage['level']:.0f} %"
     name = f"Errors inside their stated {level} region"
     spread = f"{fixed(100 * low, 1)} to {percent(high)}"
-    return [(name, fixed(100 * share, 1), "", "", "%", spread, f"should be {level}", DASH)]
+    word = coverage_word(coverage)
+    return [(name, fixed(100 * share, 1), "", "", "%", spread, f"stated {level}", word)]
 
 
 def _rig_rows(rig: Rig) -> list[tuple[str, ...]]:

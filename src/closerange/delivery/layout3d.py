@@ -61,7 +61,9 @@ class _View:
     the cameras is then on top in either case.
     """
 
-    def __init__(self, low: FloatArray, high: FloatArray, height: float, *, up: float) -> None:
+    def __init__(
+        self, low: FloatArray, high: FloatArray, size: tuple[float, float], *, up: float
+    ) -> None:
         across, depth = math.cos(_AZIMUTH), math.sin(_AZIMUTH)
         tilt, rise = math.sin(_ELEVATION), math.cos(_ELEVATION)
         right = np.array([-depth, across * up, 0.0])
@@ -69,11 +71,11 @@ class _View:
         self.axes = np.stack([right, -np.cross(back, right), back])
         self.low, self.high, self.up = low, high, up
         corners = self.axes @ _corners(low, high).T
-        size = np.ptp(corners[:2], axis=1)
-        room = np.array([FULL_WIDTH - 2 * _MARGIN, height - 2 * _MARGIN])
-        self.scale = float((room / np.maximum(size, 1e-9)).min())
+        span = np.ptp(corners[:2], axis=1)
+        room = np.array(size) - 2 * _MARGIN
+        self.scale = float((room / np.maximum(span, 1e-9)).min())
         middle = (corners[:2].min(axis=1) + corners[:2].max(axis=1)) / 2
-        self.shift = np.array([FULL_WIDTH, height]) / 2 - self.scale * middle
+        self.shift = np.array(size) / 2 - self.scale * middle
 
     def __call__(self, xyz_mm: ArrayLike) -> Point:
         """Return drawing units of one point."""
@@ -90,31 +92,36 @@ class _View:
         return float(self.low[2] if self.up > 0 else self.high[2])
 
 
-def draw_layout(rig: Rig) -> Markup:
+def draw_layout(rig: Rig, *, width: float = FULL_WIDTH) -> Markup:
     """Draw where the cameras stand and where they look.
 
     Parameters
     ----------
     rig : Rig
         Cameras and measuring volume.
+    width : float, optional
+        Of the figure, drawing units.
 
     Returns
     -------
     Markup
-        Inline SVG, as wide as the page.
+        Inline SVG.
     """
     centres = np.stack([camera.centre_mm for camera in rig.cameras])
     reach = float(np.median(np.linalg.norm(centres - rig.volume_mm.mean(axis=0), axis=1)))
     frusta = [_frustum(camera, 0.16 * reach) for camera in rig.cameras]
     everything = np.concatenate([rig.volume_mm, *frusta])
     low, high = everything.min(axis=0), everything.max(axis=0)
+    # air keeps the cameras' names off the axes, which stand on the box
+    air = 0.09 * float((high - low).max())
+    low, high = low - air, high + air
     drawing = Drawing(
-        FULL_WIDTH,
-        400,
+        width,
+        380,
         "Cameras and measuring volume",
         f"{len(rig.cameras)} cameras around the measuring volume, axes in mm",
     )
-    view = _View(low, high, drawing.height, up=_up(rig))
+    view = _View(low, high, (width, drawing.height - 26), up=_up(rig))
     _axes_box(drawing, view)
     _box(drawing, view, rig.volume_mm, PURPLE)
     for camera, frustum in zip(rig.cameras, frusta, strict=True):
@@ -125,7 +132,7 @@ def draw_layout(rig: Rig) -> Markup:
         drawing.line(
             view(camera.centre_mm), view(end), SOFT, stroke_width=0.7, stroke_dasharray="6 4"
         )
-    _key(drawing, [("measuring volume", PURPLE), ("camera: projection centre and field", BLUE)])
+    _key(drawing, [("measuring volume", PURPLE), ("camera and its field", BLUE)])
     return drawing.render()
 
 
@@ -148,9 +155,9 @@ def draw_points(
     Returns
     -------
     Markup
-        Inline SVG, as wide as the page, with a legend.
+        Inline SVG, half as wide as the page, with a legend.
     """
-    drawing = Drawing(FULL_WIDTH, 340, title, description)
+    drawing = Drawing(FULL_WIDTH / 2, 380, title, description)
     _cloud(drawing, groups, np.asarray(volume_mm, np.float64), up)
     _key(drawing, [(group.label, group.colours[0]) for group in groups if len(group.xyz_mm)])
     return drawing.render()
@@ -220,7 +227,7 @@ def _cloud(
     low, high = everything.min(axis=0), everything.max(axis=0)
     # a flat box would have no edges to carry the axes
     air = np.maximum(0.02 * (high - low), 0.04 * max(float((high - low).max()), 1e-6))
-    view = _View(low - air, high + air, drawing.height, up=up)
+    view = _View(low - air, high + air, (drawing.width, drawing.height - 26), up=up)
     _axes_box(drawing, view)
     _box(drawing, view, volume_mm, PURPLE)
     xyz = np.concatenate([np.empty((0, 3)), *(group.xyz_mm for group in groups)])
@@ -345,8 +352,9 @@ def _corners(low: FloatArray, high: FloatArray) -> FloatArray:
 
 
 def _key(drawing: Drawing, entries: Sequence[tuple[str, str]]) -> None:
-    """Write the legend in the upper right corner."""
-    for row, (label, colour) in enumerate(entries):
-        y = 14 + 15 * row
-        drawing.dot((drawing.width - 8, y - 4), 3.5, colour)
-        drawing.text((drawing.width - 16, y), label, text_anchor="end")
+    """Write the legend below the picture, from left to right."""
+    x = 12.0
+    for label, colour in entries:
+        drawing.dot((x, drawing.height - 12), 3.5, colour)
+        drawing.text((x + 8, drawing.height - 8), label)
+        x += 26 + 5.6 * len(label)  # a letter is about half as wide as high

@@ -5,7 +5,7 @@ from __future__ import annotations
 import base64
 import binascii
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -77,6 +77,11 @@ class Overlay:
         object.__setattr__(self, "flags", frozen_ints(self.flags, (count,), "flags"))
         object.__setattr__(self, "point", tuple(self.point))
         object.__setattr__(self, "size_px", (int(self.size_px[0]), int(self.size_px[1])))
+
+    @property
+    def file_name(self) -> str:
+        """Name of the image file; its folder is the machine's, not the measurement's."""
+        return self.source.replace("\\", "/").rpartition("/")[2]
 
     def to_document(self) -> dict[str, Any]:
         """Return a JSON-ready document; NaN becomes None."""
@@ -174,7 +179,7 @@ def make_overlay(
     InputError
         If the camera's rows are of several placements and none is named.
     """
-    chosen = points.of_camera(frame.camera)
+    chosen = points.select(np.array([row == frame.camera for row in points.camera], np.bool_))
     placements = sorted(set(chosen.placement))
     if placement is None and len(placements) > 1:
         raise InputError(
@@ -183,9 +188,9 @@ def make_overlay(
             remedy="name the placement of this frame",
         )
     name = placement if placement is not None else (placements or [""])[0]
-    chosen = chosen.select([row == name for row in chosen.placement])
+    chosen = chosen.select(np.array([row == name for row in chosen.placement], np.bool_))
     wanted = reading if reading is not None else next(iter(chosen.reading), "")
-    chosen = chosen.select([row == wanted for row in chosen.reading])
+    chosen = chosen.select(np.array([row == wanted for row in chosen.reading], np.bool_))
     return Overlay(
         camera=frame.camera,
         placement=name,
@@ -200,13 +205,15 @@ def make_overlay(
     )
 
 
-def draw_overlay(overlay: Overlay) -> Markup:
+def draw_overlay(overlay: Overlay, *, factor: float = 1.0) -> Markup:
     """Draw an overlay half a page wide.
 
     Parameters
     ----------
     overlay : Overlay
         Picture and points.
+    factor : float, optional
+        Magnification of the residual vectors; see `common_factor`.
 
     Returns
     -------
@@ -232,7 +239,6 @@ def draw_overlay(overlay: Overlay) -> Markup:
         preserveAspectRatio="none",
         href=f"data:image/jpeg;base64,{overlay.picture}",
     )
-    factor = overlay_factor(overlay)
     for row in np.flatnonzero(found):
         # pixel (0, 0) is a centre: the picture's corner is at (-0.5, -0.5)
         at = ((overlay.xy_px[row, 0] + 0.5) * scale, (overlay.xy_px[row, 1] + 0.5) * scale)
@@ -240,14 +246,28 @@ def draw_overlay(overlay: Overlay) -> Markup:
         _draw_mark(drawing, at, overlay.ellipse[row] * (scale, scale, 1.0), colour)
         residual = overlay.residual_px[row] * scale * factor
         if np.isfinite(residual).all():
-            drawing.arrow(at, (at[0] + residual[0], at[1] + residual[1]), VECTOR, stroke_width=1.2)
+            tip = (at[0] + residual[0], at[1] + residual[1])
+            drawing.arrow(at, tip, "#000000", stroke_width=3)
+            drawing.arrow(at, tip, VECTOR, stroke_width=1.2)
         _draw_name(drawing, at, overlay, int(row), scale, colour)
     return drawing.render()
 
 
-def overlay_factor(overlay: Overlay) -> float:
-    """Return by how much the residual vectors of an overlay are magnified."""
-    return magnification(np.linalg.norm(overlay.residual_px, axis=1), overlay.size_px)
+def common_factor(overlays: Sequence[Overlay]) -> float:
+    """Choose one magnification for the residual vectors of several overlays.
+
+    Parameters
+    ----------
+    overlays : sequence of Overlay
+        At least one.
+
+    Returns
+    -------
+    float
+        A round number; one for all, so that pictures can be compared.
+    """
+    lengths = [np.linalg.norm(overlay.residual_px, axis=1) for overlay in overlays]
+    return magnification(np.concatenate(lengths), overlays[0].size_px)
 
 
 def _draw_mark(drawing: Drawing, at: tuple[float, float], ellipse: FloatArray, colour: str) -> None:

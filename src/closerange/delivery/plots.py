@@ -193,9 +193,7 @@ def magnification(length_px: ArrayLike, size_px: tuple[int, int]) -> float:
     if not lengths.size:
         return 1.0
     # a few blunders must not shrink all the others to dots, hence a percentile
-    largest = 0.05 * size_px[0] / float(np.quantile(lengths, 0.9))
-    power = 10.0 ** math.floor(math.log10(largest))
-    return max(m * power for m in (1.0, 2.0, 5.0) if m * power <= largest * (1 + 1e-9))
+    return _round_below(0.05 * size_px[0] / float(np.quantile(lengths, 0.9)))
 
 
 def vector_plot(
@@ -241,7 +239,8 @@ def vector_plot(
         if not math.isfinite(x + y + u + v):
             continue
         foot = (x_scale(x), y_scale(y))
-        tip = _clipped(foot, (factor * scale * u, factor * scale * v), 0.25 * inner[0])
+        vector = (factor * scale * u, factor * scale * v)
+        tip = _clipped(foot, vector, (_LEFT, _TOP, _LEFT + inner[0], _TOP + inner[1]))
         colour = VERMILION if is_odd else BLUE
         style: dict[str, str | float] = {"stroke_width": 1.1}
         drawing.dot(foot, 1.4, colour)
@@ -254,8 +253,7 @@ def vector_plot(
 
 def _vector_key(drawing: Drawing, y: float, units_per_px: float, odd: bool) -> None:
     """Say how long a pixel is, and what the colours mean."""
-    step = nice_step(55 / units_per_px, 1) / 10  # a round length of 5 to 55 drawing units
-    step *= next(m for m in (10, 5, 2, 1) if m * step * units_per_px <= 60)
+    step = _round_below(60 / units_per_px)
     end = _LEFT + step * units_per_px
     drawing.arrow((_LEFT, y - 4), (end, y - 4), INK, stroke_width=1.1)
     drawing.text((end + 6, y), f"= {significant(step, 1)} px")
@@ -266,10 +264,19 @@ def _vector_key(drawing: Drawing, y: float, units_per_px: float, odd: bool) -> N
         drawing.text((_LEFT + 178, y), "not fitted (dashed)", fill=VERMILION)
 
 
-def _clipped(foot: Point, vector: Point, longest: float) -> Point:
-    """Return the tip of a vector, shortened where it would leave the neighbourhood."""
-    length = math.hypot(*vector)
-    shrink = min(1.0, longest / length) if length else 1.0
+def _round_below(limit: float) -> float:
+    """Return the largest 1, 2 or 5 times a power of ten that does not exceed a limit."""
+    power = 10.0 ** math.floor(math.log10(limit))
+    return max(m * power for m in (1.0, 2.0, 5.0) if m * power <= limit * (1 + 1e-9))
+
+
+def _clipped(foot: Point, vector: Point, frame: tuple[float, float, float, float]) -> Point:
+    """Return the tip of a vector, shortened where it would leave the frame."""
+    shrink = 1.0
+    for start, step, low, high in zip(foot, vector, frame[:2], frame[2:], strict=True):
+        room = (high if step > 0 else low) - start
+        if abs(step) > max(abs(room), 1e-9):
+            shrink = min(shrink, abs(room / step))
     return (foot[0] + shrink * vector[0], foot[1] + shrink * vector[1])
 
 
@@ -298,22 +305,31 @@ def _draw_panel(drawing: Drawing, panel: Panel, corner: Point, size: Point) -> N
         drawing.add("path", d=steps or "M0 0", stroke=panel.colour, stroke_width=0.8, fill="none")
     for place in places:
         drawing.dot(place, 1.7, panel.colour)
+    _name_levels(drawing, panel, x_scale, y_scale)
     if not places:
         drawing.text(((left + right) / 2, (top + bottom) / 2), "no value", text_anchor="middle")
 
 
 def _draw_levels(drawing: Drawing, panel: Panel, x_scale: Scale, y_scale: Scale) -> None:
-    """Draw lines across with their names above, shifted apart where they are close."""
+    """Draw lines across."""
+    for level in panel.levels:
+        if math.isfinite(level.value):
+            y = y_scale(level.value)
+            dash: dict[str, str | float] = {"stroke_dasharray": "5 3"} if level.dashed else {}
+            drawing.line((x_scale.start, y), (x_scale.end, y), INK, stroke_width=0.9, **dash)
+
+
+def _name_levels(drawing: Drawing, panel: Panel, x_scale: Scale, y_scale: Scale) -> None:
+    """Write the names of the lines over the marks, where there is room inside the frame."""
     written: list[float] = []
     for level in panel.levels:
-        if not math.isfinite(level.value):
+        if not (math.isfinite(level.value) and level.label):
             continue
         y = y_scale(level.value)
-        dash: dict[str, str | float] = {"stroke_dasharray": "5 3"} if level.dashed else {}
-        drawing.line((x_scale.start, y), (x_scale.end, y), INK, stroke_width=0.9, **dash)
-        above = level.value >= 0 and y - 13 > y_scale.end
-        base = y - 3 if above else y + 11
-        if level.label and all(abs(base - other) > 10 for other in written):
+        outward = y - 3 if level.value >= 0 else y + 10
+        inward = y + 10 if level.value >= 0 else y - 3
+        base = outward if y_scale.end + 9 < outward < y_scale.start - 1 else inward
+        if all(abs(base - other) >= 10 for other in written):
             written.append(base)
             drawing.text(
                 (x_scale.end - 3, base),
@@ -331,9 +347,9 @@ def _axes(drawing: Drawing, x_scale: Scale, y_scale: Scale, labels: tuple[str, s
     """Draw frame, grid, ticks and labels."""
     left, right = x_scale.start, x_scale.end
     top, bottom = sorted((y_scale.start, y_scale.end))
-    x_count = max(2, int((right - left) / 55))
+    x_count = max(2, int((right - left) / 42))
     x_ticks, x_step = _ticks(x_scale, x_count)
-    y_ticks, y_step = _ticks(y_scale, max(2, int((bottom - top) / 22)))
+    y_ticks, y_step = _ticks(y_scale, max(4, int((bottom - top) / 20)))
     for value in x_ticks:
         drawing.line((x_scale(value), top), (x_scale(value), bottom), RULE, stroke_width=0.6)
         drawing.text((x_scale(value), bottom + 13), tick_text(value, x_step), text_anchor="middle")

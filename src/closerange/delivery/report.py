@@ -10,6 +10,7 @@ from markupsafe import Markup, escape
 
 from closerange.delivery.calibration_section import calibration_section
 from closerange.delivery.check_sections import check_sections
+from closerange.delivery.excerpts import documents_of
 from closerange.delivery.facts import provenance_section
 from closerange.delivery.front_page import figures_table, front_picture, verdict
 from closerange.delivery.glossary import glossary_section, words_in
@@ -89,35 +90,6 @@ def render_report(  # noqa: PLR0913 - each argument is one thing that a report m
         headline=headline,
     )
     return _render(contents)
-
-
-def documents_of(checks: Sequence[object]) -> tuple[Mapping[str, Any], ...]:
-    """Turn verification results into their documents; documents stay as they are.
-
-    Parameters
-    ----------
-    checks : sequence of object
-        Results with a `to_document` method, or mappings.
-
-    Returns
-    -------
-    tuple of mapping
-        In the same order.
-
-    Raises
-    ------
-    TypeError
-        If something is neither.
-    """
-    documents: list[Mapping[str, Any]] = []
-    for check in checks:
-        document = check if isinstance(check, Mapping) else None
-        if document is None and hasattr(check, "to_document"):
-            document = check.to_document()
-        if not isinstance(document, Mapping):
-            raise TypeError(f"{type(check).__name__} is not a verification result")
-        documents.append(document)
-    return tuple(documents)
 
 
 def _render(contents: Contents) -> str:

@@ -8,7 +8,7 @@ from itertools import groupby
 import numpy as np
 
 from closerange.delivery.excerpts import shown
-from closerange.delivery.overlays import draw_overlay, overlay_factor
+from closerange.delivery.overlays import common_factor, draw_overlay
 from closerange.delivery.plots import axis_panels, panel_grid
 from closerange.delivery.sheet import Block, Contents, Figure, Paragraph, Section, Table
 from closerange.delivery.volume_plots import draw_slices
@@ -112,6 +112,7 @@ def pictures_section(contents: Contents) -> Section | None:
         "are residuals of the calibration, observed minus calculated, magnified as stated."
     )
     blocks: list[Block] = [Paragraph(text)]
+    factor = common_factor(contents.overlays)
     for overlay in contents.overlays:
         found = int(np.isfinite(overlay.xy_px).all(axis=1).sum())
         words = [f"Camera {overlay.camera}"]
@@ -119,11 +120,11 @@ def pictures_section(contents: Contents) -> Section | None:
             words.append(f"placement {overlay.placement}")
         words.append(f"{found} of {counted(len(overlay.point), 'point')} found")
         if np.isfinite(overlay.residual_px).any():
-            words.append(f"residuals magnified {significant(overlay_factor(overlay))} times")
+            words.append(f"residuals magnified {significant(factor)} times")
         width, height = overlay.size_px
-        source = f" ({overlay.source})" if overlay.source else ""
+        source = f" ({overlay.file_name})" if overlay.file_name else ""
         caption = f"{', '.join(words)}; image {width} x {height} px{source}."
-        blocks.append(Figure(draw_overlay(overlay), caption, half=True))
+        blocks.append(Figure(draw_overlay(overlay, factor=factor), caption, half=True))
     return Section("pictures", "Pictures with detected points", tuple(blocks))
 
 
@@ -186,27 +187,29 @@ def flags_section(contents: Contents) -> Section | None:
         ("positions", None if contents.positions is None else contents.positions.flags),
     ]
     present = [(name, flags) for name, flags in columns if flags is not None and len(flags)]
-    documents = " ".join(_document_flags(contents))
+    checked = [name for cell in _document_flags(contents) for name in cell.split("|")]
     rows = []
     for bit in Flag:
         counts = [int(((flags & int(bit)) != 0).sum()) for _, flags in present]
-        if any(counts) or str(bit.name) in documents.split():
+        counts += [checked.count(str(bit.name))] if contents.checks else []
+        if any(counts):
             rows.append((str(bit.name), FLAG_WORDS[bit], *map(str, counts)))
     if not rows:
         return None
     text = "A flag always means a defect; rows without a flag are not listed here."
-    head = ("flag", "meaning", *(name for name, _ in present))
+    last = ("verified rows",) if contents.checks else ()
+    head = ("flag", "meaning", *(name for name, _ in present), *last)
     table = Table("Flags that occur", head, rows, texts=frozenset({0, 1}))
     return Section("flags", "Flags", (Paragraph(text), table))
 
 
 def _document_flags(contents: Contents) -> Iterator[str]:
-    """Yield the flag cells of all verification results, names parted by blanks."""
+    """Yield the flag cells of all verification results."""
     for check in contents.checks:
-        for cell in check["rows"].get("flags", ()):
-            yield cell.replace("|", " ")
-        for row in check.get("left_out", ()):
-            yield row[-1].replace("|", " ")
+        yield from check["rows"].get("flags", ())
+        # rows of a single-point test are positions; readings left out are not among them
+        for row in check.get("left_out", ()) if check["kind"] == "single-point" else ():
+            yield row[-1]
 
 
 def _rig_sentence(rig: Rig) -> str:
@@ -290,7 +293,7 @@ def _readings(positions: Positions) -> list[Block]:
         f"Z {micrometres(std[2])} µm."
     )
     title = "Readings at one position"
-    picture = panel_grid(panels, columns=1, height=126, title=title, description=caption)
+    picture = panel_grid(panels, columns=1, height=108, title=title, description=caption)
     return [Figure(picture, caption)]
 
 

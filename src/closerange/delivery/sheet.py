@@ -94,6 +94,10 @@ class Table:
         Rows to be marked as defective; the row's words say why.
     wide : bool
         Small print, for tables of many columns.
+    dense : bool
+        Smallest print, for long lists that are looked up, not read.
+    breakable : bool
+        Cells of long texts without blanks, such as paths, may be broken anywhere.
     """
 
     caption: str
@@ -102,7 +106,14 @@ class Table:
     texts: frozenset[int] = frozenset({0})
     marked: frozenset[int] = frozenset()
     wide: bool = False
+    breakable: bool = False
+    dense: bool = False
     kind: str = "table"
+
+    @property
+    def style(self) -> str:
+        """Return the classes of the style sheet."""
+        return " ".join(name for name in ("wide", "breakable", "dense") if getattr(self, name))
 
 
 @dataclass(frozen=True, slots=True)

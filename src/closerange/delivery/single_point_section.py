@@ -125,12 +125,7 @@ def _sample_figures(check: Mapping[str, Any]) -> list[Block]:
             levels=std_levels,
             mark="stem",
         ),
-        _by_number(
-            mean,
-            ("mean of the readings", "mm"),
-            "Mean of the readings, for each position.",
-            mark="dot",
-        ),
+        _by_number(mean, ("mean of the readings", "mm"), "Mean of the readings.", mark="dot"),
         _by_number(
             1000 * error,
             ("error: actual minus mean", "µm"),
@@ -159,7 +154,7 @@ def _by_number(
         mark=mark,
         zero=mark == "stem",
     )
-    picture = panel_grid(panels, columns=1, height=126, title=names[0], description=caption)
+    picture = panel_grid(panels, columns=1, height=108, title=names[0], description=caption)
     return Figure(picture, caption)
 
 
@@ -201,12 +196,13 @@ def _position_dependence(check: Mapping[str, Any]) -> list[Block]:
         "Error of each axis (actual minus mean) against each coordinate, with the line of the "
         "linear fit by all three coordinates together. * = a slope that chance hardly explains."
     )
-    blocks: list[Block] = [Figure(picture, caption)]
-    if cells:
-        head = ("error", "slope [µm per mm]", "probability by chance", "depends")
-        title = "How errors depend on the position (slope ± standard error)"
-        blocks.append(Table(title, head, cells, texts=frozenset({0, 3})))
-    return blocks
+    return [Figure(picture, caption), *_slope_table(cells)]
+
+
+def _slope_table(cells: Sequence[Sequence[str]]) -> list[Block]:
+    head = ("error", "slope [µm per mm]", "probability by chance", "depends")
+    title = "How errors depend on the position (slope ± standard error)"
+    return [Table(title, head, cells, texts=frozenset({0, 3}))] if cells else []
 
 
 def _expected_and_found(check: Mapping[str, Any]) -> Terms:

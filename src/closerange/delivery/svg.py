@@ -61,7 +61,8 @@ def heat_colour(fraction: float) -> str:
 
 def ink_on(fraction: float) -> str:
     """Return the text colour that is readable on `heat_colour` of the same value."""
-    return PAPER if fraction > 0.55 else INK
+    # black and white have equal contrast, 4.6, on a luminance of 0.18: at 0.66 of the scale
+    return PAPER if fraction > 0.66 else "#000000"
 
 
 @dataclass(slots=True)
@@ -125,7 +126,7 @@ class Drawing:
         head = min(5.0, 0.45 * length)
         base = (end[0] - head * along[0], end[1] - head * along[1])
         self.line(start, base, colour, **style)
-        half = 0.4 * head
+        half = 0.4 * head + (float(style.get("stroke_width", 1)) - 1) / 3
         left = (base[0] - half * along[1], base[1] + half * along[0])
         right = (base[0] + half * along[1], base[1] - half * along[0])
         self.path([end, left, right], closed=True, fill=colour)

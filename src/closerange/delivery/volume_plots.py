@@ -47,7 +47,7 @@ def draw_volume(error_map: ErrorMap) -> Markup:
     ends = (known.min(), known.max()) if known.size else (np.nan, np.nan)
     top = _round_top(total_um)
     picked = _levels(nodes.shape[2])[::-1]
-    tallest = 122.0
+    tallest = 88.0
     drawing = Drawing(
         FULL_WIDTH,
         64 + len(picked) * (tallest + 16),
@@ -205,6 +205,15 @@ def _flat_map(
                 font_size=8.5,
                 fill=ink_on(value / top),
             )
+    _map_axes(drawing, edges, corner, scale)
+
+
+def _map_axes(
+    drawing: Drawing, edges: tuple[FloatArray, FloatArray], corner: Point, scale: float
+) -> None:
+    """Write the ranges of X below and of Y at the left of a flat map."""
+    x_edges, y_edges = edges
+    bottom = corner[1] + scale * float(y_edges[-1] - y_edges[0])
     for x, anchor in ((x_edges[0], "start"), (x_edges[-1], "end")):
         place = corner[0] + scale * float(x - x_edges[0])
         drawing.text((place, bottom + 12), _coordinate(x), text_anchor=anchor, font_size=10)

@@ -36,9 +36,13 @@ MIN_RADIUS_PX = 3.0
 MAX_RADIUS_PX = 12.0
 """Largest window: beyond it the edges of a wide-angle image bend by hundredths of a pixel."""
 
-MAX_BLUR_SHARE = 0.25
-"""Largest edge blur (sigma) over the distance to the next line: the blurred edges of one
-square, some four sigma wide, would touch."""
+MAX_BLUR_SHARE = 0.2
+"""Largest edge blur (sigma) over the distance to the next line: the two edges of a square,
+each some four sigma wide, all but touch."""
+
+CONTINUES_SHARE = 0.75
+"""Share of a corner's contrast that a place outside has if the board goes on there: all of it;
+half where the board ends on an even ground."""
 
 SATURATED_SHARE = 0.01
 
@@ -102,6 +106,7 @@ def find_chessboard(frame: Frame, board: Chessboard) -> Corners:
             "count inner corners, not squares",
         )
     xy = canonical_order(found.reshape(board.rows, board.columns, 2), image, board)
+    _refuse_larger_board(xy, image, board)
     places = _places(board.rows, board.columns)
     return _measured(frame, xy.reshape(-1, 2), places, FREE_SHARE)
 
@@ -239,6 +244,43 @@ def _first_is_dark(xy: FloatArray, image: NDArray[Any]) -> bool:
     row, column = np.mgrid[: grey.shape[0], : grey.shape[1]]
     even = (row + column) % 2 == 0
     return bool(grey[even].mean() < grey[~even].mean())
+
+
+def _refuse_larger_board(xy: FloatArray, image: NDArray[Any], board: Chessboard) -> None:
+    """Refuse if the pattern goes on: the classic finder also takes a part of a larger board."""
+    middle = _saddle(xy[1:-1, 1:-1], xy[1:-1, 2:], xy[2:, 1:-1], image)
+    contrast = float(np.median(np.abs(middle)))
+    for side in range(4):
+        # the first row of the turned grid is one of the four sides
+        turned = np.rot90(xy, side)
+        outside = 2 * turned[0] - turned[1]
+        along = np.roll(turned[0], -1, axis=0)
+        across = 2 * outside - turned[0]
+        saddle = _saddle(
+            outside[:-1], outside[:-1] + along[:-1] - turned[0, :-1], across[:-1], image
+        )
+        # where the board ends, one half is even: half of the saddle
+        if np.median(np.abs(saddle)) > CONTINUES_SHARE * contrast:
+            raise DetectionError(
+                f"the chessboard goes on beyond {board.rows} x {board.columns} inner corners",
+                remedy="count the inner corners of the whole board and correct rows and columns",
+            )
+
+
+def _saddle(
+    corner: FloatArray, along: FloatArray, across: FloatArray, image: NDArray[Any]
+) -> FloatArray:
+    """Return half the grey difference between the two diagonals of squares at corners."""
+    u, v = (along - corner) / 4, (across - corner) / 4
+    height, width = image.shape
+    total: FloatArray = np.zeros(corner.shape[:-1])
+    for sign, offset in ((1, u + v), (1, -u - v), (-1, u - v), (-1, v - u)):
+        place = np.rint(corner + offset).astype(np.int64)
+        x, y = place[..., 0], place[..., 1]
+        seen = (x >= 0) & (x < width) & (y >= 0) & (y < height)
+        grey = image[np.clip(y, 0, height - 1), np.clip(x, 0, width - 1)].astype(np.float64)
+        total += np.where(seen, sign * grey, np.nan) / 4
+    return np.nan_to_num(total)  # outside of the image nothing goes on
 
 
 def _roll(xy: FloatArray) -> float:

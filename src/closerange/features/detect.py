@@ -10,7 +10,7 @@ import numpy as np
 from closerange.errors import CloseRangeWarning, DetectionError
 from closerange.features.chessboard import Corners, find_charuco, find_chessboard
 from closerange.features.disc_grid import label_discs
-from closerange.features.discs import Discs, find_discs
+from closerange.features.discs import Discs, find_discs, saturation_level
 from closerange.features.image_points import ImagePoints
 from closerange.features.target import Charuco, Chessboard, DiscGrid, Target
 from closerange.flags import Flag
@@ -181,7 +181,7 @@ def _saturated_share(frame: Frame, points: ImagePoints) -> float:
         hull = cv2.convexHull(xy.astype(np.float32)).reshape(-1, 2)
         cv2.fillConvexPoly(mask, np.rint(hull).astype(np.int32), 1)
     inside = frame.pixels[mask > 0]
-    return float((inside >= frame.full_scale).mean()) if inside.size else 0.0
+    return float((inside >= saturation_level(frame)).mean()) if inside.size else 0.0
 
 
 def _warn_of(flags: IntArray, flag: Flag, text: str) -> None:

@@ -2,76 +2,38 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, Literal, TypeAlias
+from typing import Any
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from closerange.errors import GeometryError, InputError
-from closerange.features.borders import follow_borders
+from closerange.errors import InputError
+from closerange.features.blobs import SMALLEST_AREA_PX, Candidate, blobs, judge, refined
 from closerange.features.threshold import ThresholdReport, threshold_report
-from closerange.geometry.arrays import BoolArray, FloatArray, IntArray
-from closerange.geometry.ellipse import Ellipse, fit_ellipse
+from closerange.geometry.arrays import BoolArray
 from closerange.images.frame import Frame
 
-Polarity: TypeAlias = Literal["white-on-dark", "dark-on-white"]
-Strategy: TypeAlias = Literal["auto", "global", "local"]
 POLARITIES = ("white-on-dark", "dark-on-white")
 STRATEGIES = ("auto", "global", "local")
 
-# Fewer pixels than parameters of an ellipse plus its two grey levels cannot be told from noise.
-SMALLEST_AREA_PX = 8
-# A disc seen more than 75 degrees from its normal is not readable in print or in paint.
-SMALLEST_AXIS_RATIO = 0.25
-# Of all shapes with the same second moments the ellipse has the largest area: the quotient is
-# 1 for an ellipse, 0.955 for a square, 0.83 for a triangle, less for rings and branches.
-# Jagged borders of small blobs cost about a pixel's width of perimeter noise, hence 2 / a.
-SMALLEST_ELLIPTICITY, ELLIPTICITY_PX = 0.97, 0.25
-# Border pixels scatter by 0.3 px where the outline is rounded to pixels; noise on a faint, small
-# disc doubles that. A tenth of it grows with the disc: light that varies bends the outline.
-BORDER_RMS_PX, BORDER_RMS_SHARE = 0.5, 0.02
-# Mean contrast times sqrt(area) over the noise: at 10 a chance speck among 10^7 places is out
-# of question and the centre is good to about a tenth of the radius.
-SMALLEST_SIGNIFICANCE = 10.0
-# Part of a disc that must be inside the image for its outline to say anything of the rest.
-SMALLEST_VISIBLE_SHARE = 0.5
 # Noise floor of the local strategy: one in 3 million Gaussian pixels exceeds five sigma.
 FLOOR_SIGMAS = 5.0
 # Smoothing of the local strategy: matched to the smallest dots, radius 2 px.
 SMOOTHING_PX = 1.0
-# Sides of the square structuring elements: each serves discs up to 0.8 of its side; the last
-# covers discs of a third of the image's height.
+# Sides of the square structuring elements: each serves discs up to 0.8 of its side, because the
+# smoothed foot of a disc's edge must fit as well. Light on a disc larger than half of the
+# image is beyond what a flat structuring element can even out.
 FIRST_ELEMENT_PX = 11
-ELEMENT_FILL = 0.8
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Candidate:
-    """One blob that looks like an ellipse.
-
-    Attributes
-    ----------
-    outline : Ellipse
-        Ellipse of the blob's area moments; where the image border cuts the blob, the ellipse
-        through the rest of its outline.
-    border : ndarray of int, shape (N, 2)
-        Border pixels x, y in order of following.
-    at_border : bool
-        Whether the blob touches the image border.
-    contrast : float
-        Mean grey value of the blob minus that of a ring around it.
-    significance : float
-        |contrast| sqrt(area) / noise.
-    """
-
-    outline: Ellipse
-    border: IntArray
-    at_border: bool
-    contrast: float
-    significance: float
+ELEMENT_FILL, SMALLEST_FILL = 0.8, 0.3
+LARGEST_LOCAL_SHARE = 0.5
+# The largest disc of the global strategy: it needs some background on both sides.
+LARGEST_GLOBAL_SHARE = 0.9
+# Discs of one target differ by this factor at most: larger marks, perspective.
+SAME_SIZE = 2.0
+CONVINCING_SHARE = 0.8
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -100,9 +62,7 @@ class DiscCandidates:
     noise: float
 
 
-def find_candidates(
-    frame: Frame, *, polarity: Polarity, strategy: Strategy = "auto"
-) -> DiscCandidates:
+def find_candidates(frame: Frame, *, polarity: str, strategy: str = "auto") -> DiscCandidates:
     """Find blobs of one polarity that look like ellipses.
 
     Parameters
@@ -115,7 +75,8 @@ def find_candidates(
         "global": one Trussell threshold for the image, as in the thesis. "local": white (or
         black) top-hats with structuring elements of growing size remove uneven light, then
         Trussell's threshold, but never below five times the noise, and once more around each
-        blob. "auto": whichever finds more; "global" if they find as many.
+        blob. "auto": "global", completed by what "local" finds in the same sizes, or wholly if
+        "local" finds more blobs of one size.
 
     Returns
     -------
@@ -138,8 +99,14 @@ def find_candidates(
     whole = _global(pixels, noise)
     if strategy == "global":
         return whole
-    local = _local(pixels, noise)
-    return local if _score(local) > _score(whole) else whole
+    size, count = _usual_size(whole)
+    # Where nearly all that the threshold left are discs of one size, only more of that size can
+    # be missing (in the shade): one structuring element finds them.
+    convincing = count > 0 and count >= CONVINCING_SHARE * _islands(whole.foreground)
+    local = (
+        _local(pixels, noise, size_px=size, known=whole) if convincing else _local(pixels, noise)
+    )
+    return _joined(whole, local)
 
 
 def pixel_noise(pixels: NDArray[Any]) -> float:
@@ -168,139 +135,127 @@ def pixel_noise(pixels: NDArray[Any]) -> float:
 def _global(pixels: NDArray[Any], noise: float) -> DiscCandidates:
     report = threshold_report(pixels)
     mask = pixels > report.threshold
-    found = [
-        c for blob in _blobs(mask, _largest_side(pixels)) if (c := _judge(pixels, blob, noise))
-    ]
-    return DiscCandidates(tuple(found), mask, "global", report, noise)
+    found: list[Candidate] = []
+    for blob in blobs(mask, LARGEST_GLOBAL_SHARE * min(pixels.shape)):
+        found += judge(pixels, blob, noise)
+    return DiscCandidates(_ordered(found), mask, "global", report, noise)
 
 
-def _local(pixels: NDArray[Any], noise: float) -> DiscCandidates:
-    smooth = cv2.GaussianBlur(pixels.astype(np.float32), (0, 0), SMOOTHING_PX)
-    best: list[Candidate] = []
-    foreground = np.zeros(pixels.shape, dtype=bool)
+def _local(
+    pixels: NDArray[Any],
+    noise: float,
+    *,
+    size_px: float | None = None,
+    known: DiscCandidates | None = None,
+) -> DiscCandidates:
+    """Look at top-hats of growing elements, or at the one for discs of a known semi-axis.
+
+    Blobs upon `known` candidates are passed over.
+    """
+    fine = _fine_steps(pixels)
+    covered = _painted(known.candidates if known else (), fine.shape)
+    found: list[Candidate] = []
     reports: list[tuple[int, ThresholdReport]] = []
-    side = FIRST_ELEMENT_PX
-    while side * ELEMENT_FILL <= _largest_side(pixels):
+    seen: set[tuple[int, ...]] = set()
+    for side in _sides(fine.shape, size_px):
         element = cv2.getStructuringElement(cv2.MORPH_RECT, (side, side))
-        residue = cv2.morphologyEx(smooth, cv2.MORPH_TOPHAT, element)
-        middle = float(np.median(residue))
-        spread = 1.4826 * float(np.median(np.abs(residue - middle)))
-        report = threshold_report(np.rint(residue), floor=middle + FLOOR_SIGMAS * spread)
-        found = []
-        for level in sorted({report.floor, report.threshold}):
-            mask = residue > level
-            foreground |= mask
-            for blob in _blobs(mask, ELEMENT_FILL * side):
-                candidate = _judge(pixels, _refined(residue, blob, report.floor), noise)
-                if candidate is not None:
-                    found.append(candidate)
-        reports.append((len(found), report))
-        best += found
-        side = 2 * side - 1
-    most = max(reports, key=lambda item: item[0])[1] if reports else threshold_report(pixels)
-    return DiscCandidates(tuple(_without_doubles(best)), foreground, "local", most, noise)
+        residue = cv2.morphologyEx(fine, cv2.MORPH_TOPHAT, element)
+        report = threshold_report(residue, floor=_floor(residue))
+        # What is smaller has been seen at the scale before, or is not of the wanted size.
+        smallest_side = 0.0 if side == FIRST_ELEMENT_PX else SMALLEST_FILL * side
+        before = len(found)
+        levels = {report.floor, report.threshold} if size_px is None else {report.floor}
+        for level in sorted(levels):
+            for rough in blobs(residue > level, ELEMENT_FILL * side, smallest_side):
+                if known and covered[rough.window][rough.mask].any():
+                    continue
+                blob = refined(residue, rough, report.floor)
+                if blob.signature not in seen:
+                    seen.add(blob.signature)
+                    found += judge(pixels, blob, noise)
+        reports.append((len(found) - before, report))
+    found = _without_doubles(found)
+    report = max(reports, key=lambda item: item[0])[1]
+    return DiscCandidates(tuple(found), _painted(found, fine.shape), "local", report, noise)
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class _Blob:
-    """A connected region: its mask in a window and the window's first x, y."""
-
-    mask: BoolArray
-    first: tuple[int, int]
-
-
-def _blobs(mask: BoolArray, largest_side: float) -> Iterator[_Blob]:
-    """Give the 8-connected regions whose size could be that of a disc, from top to bottom."""
-    _, labels, stats, _ = cv2.connectedComponentsWithStats(mask.astype(np.uint8), connectivity=8)
-    width, height, area = stats[:, 2], stats[:, 3], stats[:, 4]
-    # An ellipse fills pi/4 = 0.79 of its upright bounding box, a slanted one of axis ratio 0.25
-    # still 0.37; whole pixels are a little less strict.
-    fits = (np.maximum(width, height) <= largest_side) & (area >= SMALLEST_AREA_PX)
-    fits &= area >= 0.3 * width * height
-    fits[0] = False  # the background
-    for label in np.flatnonzero(fits):
-        x, y, w, h = (int(v) for v in stats[label, :4])
-        yield _Blob(labels[y : y + h, x : x + w] == label, (x, y))
+def _sides(shape: tuple[int, ...], size_px: float | None) -> list[int]:
+    """Sides of the structuring elements, each about twice as large as the one before."""
+    if size_px is not None:
+        return [2 * int(np.ceil(size_px * np.sqrt(SAME_SIZE) / ELEMENT_FILL)) + 1]
+    sides = [FIRST_ELEMENT_PX]
+    while (2 * sides[-1] - 1) * ELEMENT_FILL <= LARGEST_LOCAL_SHARE * min(shape):
+        sides.append(2 * sides[-1] - 1)
+    return sides
 
 
-def _refined(residue: FloatArray, blob: _Blob, floor: float) -> _Blob:
-    """Threshold the surroundings of a blob by themselves and keep the region that it became."""
-    (x, y), (h, w) = blob.first, blob.mask.shape
-    x0, y0 = max(x - 2, 0), max(y - 2, 0)
-    window = residue[y0 : y + h + 2, x0 : x + w + 2]
-    level = threshold_report(np.rint(window), floor=floor).threshold
-    count, labels = cv2.connectedComponents((window > level).astype(np.uint8), connectivity=8)
-    if count < 2:
-        return blob
-    own = np.zeros(window.shape, dtype=bool)
-    own[y - y0 : y - y0 + h, x - x0 : x - x0 + w] = blob.mask
-    sizes = np.bincount(labels[own], minlength=count)
-    label = int(np.argmax(sizes[1:])) + 1
-    rows, columns = np.nonzero(labels == label)
-    part = labels[rows.min() : rows.max() + 1, columns.min() : columns.max() + 1] == label
-    return _Blob(part, (x0 + int(columns.min()), y0 + int(rows.min())))
+def _fine_steps(pixels: NDArray[Any]) -> NDArray[np.uint16]:
+    """Smoothed image in sixteenths of a grey value, or in what 16 bits allow."""
+    steps = 16 if pixels.dtype == np.uint8 else 1
+    smooth = cv2.GaussianBlur(pixels.astype(np.float32) * steps, (0, 0), SMOOTHING_PX)
+    fine: NDArray[np.uint16] = np.rint(smooth).astype(np.uint16)
+    return fine
 
 
-def _judge(pixels: NDArray[Any], blob: _Blob, noise: float) -> Candidate | None:
-    """Make a candidate of a blob that passes all gates."""
-    (x, y), (h, w) = blob.first, blob.mask.shape
-    height, width = pixels.shape
-    at_border = x == 0 or y == 0 or x + w == width or y + h == height
-    area = int(np.count_nonzero(blob.mask))
-    if area < SMALLEST_AREA_PX:
-        return None
-    border = max(follow_borders(blob.mask), key=len) + np.array(blob.first)
-    try:
-        outline = _cut_outline(border, pixels.shape) if at_border else _moment_outline(blob)
-    except GeometryError:
-        return None
-    a, b, _ = outline.axes
-    share = area / outline.area
-    least = SMALLEST_VISIBLE_SHARE if at_border else SMALLEST_ELLIPTICITY - ELLIPTICITY_PX / a
-    if b < SMALLEST_AXIS_RATIO * a or share < least:
-        return None
-    seen = _not_at_rim(border, pixels.shape) if at_border else border
-    if outline.signed_distance(seen).std() > BORDER_RMS_PX + BORDER_RMS_SHARE * a:
-        return None
-    contrast = _contrast(pixels, blob)
-    significance = contrast * float(np.sqrt(area)) / noise
-    if not significance > SMALLEST_SIGNIFICANCE:
-        return None
-    return Candidate(outline, border, at_border, contrast, significance)
+def _floor(residue: NDArray[np.uint16]) -> float:
+    """Median plus five robust sigma of a top-hat image, which is background for the most part."""
+    half = residue.size / 2
+    middle = int(np.searchsorted(np.cumsum(np.bincount(residue.ravel())), half))
+    deviation = np.abs(residue.astype(np.int32) - middle)
+    spread = int(np.searchsorted(np.cumsum(np.bincount(deviation.ravel())), half))
+    return middle + FLOOR_SIGMAS * 1.4826 * max(spread, 1)
 
 
-def _moment_outline(blob: _Blob) -> Ellipse:
-    """Ellipse of the blob's first and second moments, its pixels being unit squares."""
-    rows, columns = np.nonzero(blob.mask)
-    points = np.stack([columns, rows]).astype(np.float64)
-    covariance = np.cov(points, bias=True) + np.eye(2) / 12
-    return Ellipse.of_moments(points.mean(axis=1) + blob.first, covariance)
+def _painted(candidates: Sequence[Candidate], shape: tuple[int, ...]) -> BoolArray:
+    """Return the mask of all candidates' blobs."""
+    image = np.zeros(shape, dtype=np.uint8)
+    borders = [np.ascontiguousarray(c.border.reshape(-1, 1, 2), np.int32) for c in candidates]
+    cv2.drawContours(image, borders, -1, 1, cv2.FILLED)
+    return image > 0
 
 
-def _cut_outline(border: IntArray, shape: tuple[int, ...]) -> Ellipse:
-    """Ellipse through the part of a border that is not the image's, half a pixel outside it."""
-    inner = fit_ellipse(_not_at_rim(border, shape))
-    a, b, angle = inner.axes
-    return Ellipse.of(inner.centre, a + 0.5, b + 0.5, angle)
+def _joined(whole: DiscCandidates, local: DiscCandidates) -> DiscCandidates:
+    """Join both strategies; the less fruitful one adds what the other has not.
+
+    Where the global strategy has as many discs of one size, what else the local one found is
+    taken for specks unless it has that size.
+    """
+    size, count = _usual_size(whole)
+    more_local = _usual_size(local)[1] > count
+    base, other = (local, whole) if more_local else (whole, local)
+    centres = np.array([c.outline.centre for c in base.candidates]).reshape(-1, 2)
+    reach = np.array([c.outline.axes[0] for c in base.candidates])
+    added = []
+    for candidate in other.candidates:
+        a = candidate.outline.axes[0]
+        if other is local and not size / SAME_SIZE <= a <= size * SAME_SIZE:
+            continue
+        apart = np.hypot(*(centres - candidate.outline.centre).T)
+        if not (apart < np.maximum(reach, a)).any():
+            added.append(candidate)
+    foreground = base.foreground | _painted(added, base.foreground.shape)
+    joined = _ordered([*base.candidates, *added])
+    return DiscCandidates(joined, foreground, base.strategy, base.thresholds, base.noise)
 
 
-def _not_at_rim(border: IntArray, shape: tuple[int, ...]) -> IntArray:
-    height, width = shape
-    return border[((border > 0) & (border < [width - 1, height - 1])).all(axis=1)]
+def _islands(mask: BoolArray) -> int:
+    """Count the regions that do not touch the image border and are no mere specks."""
+    height, width = mask.shape
+    _, _, stats, _ = cv2.connectedComponentsWithStats(mask.astype(np.uint8), connectivity=8)
+    x, y, w, h, area = stats[1:].T
+    inside = (x > 0) & (y > 0) & (x + w < width) & (y + h < height)
+    return int(np.count_nonzero(inside & (area >= SMALLEST_AREA_PX)))
 
 
-def _contrast(pixels: NDArray[Any], blob: _Blob) -> float:
-    """Mean of the blob minus the median of a ring that begins two pixels outside it."""
-    (x, y), (h, w) = blob.first, blob.mask.shape
-    x0, y0 = max(x - 5, 0), max(y - 5, 0)
-    window = pixels[y0 : y + h + 5, x0 : x + w + 5]
-    own = np.zeros(window.shape, dtype=np.uint8)
-    own[y - y0 : y - y0 + h, x - x0 : x - x0 + w] = blob.mask
-    near, far = (cv2.dilate(own, np.ones((size, size), np.uint8)) for size in (5, 11))
-    ring = (far > 0) & (near == 0)
-    if not ring.any():
-        return 0.0
-    return float(window[own > 0].mean() - np.median(window[ring]))
+def _usual_size(found: DiscCandidates) -> tuple[float, int]:
+    """Semi-axis that has most candidates within a factor of `SAME_SIZE`, and how many."""
+    sizes = np.sort([c.outline.axes[0] for c in found.candidates if not c.at_border])
+    if sizes.size == 0:
+        return 0.0, 0
+    root = np.sqrt(SAME_SIZE)
+    counts = np.searchsorted(sizes, sizes * root, "right") - np.searchsorted(sizes, sizes / root)
+    best = int(np.argmax(counts))
+    return float(sizes[best]), int(counts[best])
 
 
 def _without_doubles(candidates: list[Candidate]) -> list[Candidate]:
@@ -315,13 +270,9 @@ def _without_doubles(candidates: list[Candidate]) -> list[Candidate]:
             continue
         kept.append(candidate)
         centres, reach = np.vstack([centres, centre]), np.append(reach, size)
-    return sorted(kept, key=lambda c: (c.outline.centre[1], c.outline.centre[0]))
+    return list(_ordered(kept))
 
 
-def _largest_side(pixels: NDArray[Any]) -> float:
-    """Largest disc looked for: it needs background on both sides of it."""
-    return 0.9 * min(pixels.shape)
-
-
-def _score(found: DiscCandidates) -> int:
-    return sum(not candidate.at_border for candidate in found.candidates)
+def _ordered(candidates: list[Candidate]) -> tuple[Candidate, ...]:
+    """Sort from the top of the image to its bottom."""
+    return tuple(sorted(candidates, key=lambda c: (c.outline.centre[1], c.outline.centre[0])))

@@ -19,10 +19,14 @@ from closerange.geometry.least_squares import LeastSquaresFit, levenberg_marquar
 BAND_BLURS, BAND_FLAT_PX = 3.0, 1.5
 # A pixel next to another feature is left out where that feature's own blur reaches it.
 NEIGHBOUR_BLURS = 2.0
-# Blur of a lens in focus, pixel box included (1/12 px^2), and how far it may be off: a factor 2
-# is one sigma. A thousand pixels overrule it; on a disc of a dozen pixels, where blur, size and
-# contrast are exchangeable, it decides.
-USUAL_BLUR_PX, BLUR_LOG_STD = 0.8, float(np.log(2.0))
+# Foreground this near to a disc's outline is its own edge.
+OWN_EDGE_PX = 2.0
+# A pixel is a square, not a point: of all edges it takes this variance.
+PIXEL_BLUR_PX2 = 1 / 12
+# Blur of a lens in focus, and how far it may be off: a factor 2 is one sigma. A thousand pixels
+# overrule it; on a disc of a dozen pixels, where blur, size and contrast are exchangeable, it
+# decides.
+USUAL_LENS_PX, LENS_LOG_STD = 0.75, float(np.log(2.0))
 # Below this radius (blurs) the interior has no flat middle that could show a slope of its own.
 SLOPE_RADIUS_BLURS = 6.0
 # Rounding to whole grey values: uniform over one of them.
@@ -31,10 +35,16 @@ QUANTISATION_DN2 = 1 / 12
 # of their own (to a quarter of its value).
 FLAT_SHARE, FLAT_PIXELS = 0.03, 30
 IMAGINED_PIXELS = 2
+# Undulations of the outline shorter than this are damped by the blur and the pixels; with fewer
+# degrees of freedom than this their variance is known to no better than a half.
+ROUGHNESS_WAVE_PX, ROUGHNESS_DOF = 6.0, 8
 # A blur beyond 0.02 .. 50 px is not what this model describes.
 LARGEST_LOG_BLUR = 4.0
+# A step of this share of all grey values over their noise (some thousands) is a hundredth of a
+# standard deviation; the first pass only places the band and the weights.
+FIRST_STEP_LIMIT, STEP_LIMIT = 1e-4, 1e-6
 MAX_PASSES = 4
-MAX_ITERATIONS = 40
+MAX_ITERATIONS = 30
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -76,8 +86,7 @@ def fit_disc(
     start: Ellipse,
     *,
     full_scale: float = np.inf,
-    other: BoolArray | None = None,
-    blur_px: float = USUAL_BLUR_PX,
+    foreground: BoolArray | None = None,
 ) -> DiscFit:
     """Fit the grey values of a disc with a blurred ellipse.
 
@@ -89,11 +98,10 @@ def fit_disc(
         Approximate outline in px, good to about a pixel.
     full_scale : float, optional
         Grey value at which the sensor clips.
-    other : ndarray of bool, shape (H, W), optional
-        Pixels of other features: the band stays away from them by their blur, but never by
-        more than half of the gap.
-    blur_px : float, optional
-        First guess of the blur.
+    foreground : ndarray of bool, shape (H, W), optional
+        Pixels of this and other features. What lies within two pixels of the start's outline is
+        the disc's own; from the rest the band stays away by its blur, but never by more than
+        half of the gap.
 
     Returns
     -------
@@ -109,8 +117,8 @@ def fit_disc(
     bias, and they do not count in the residual variance. Weights come from the variances that
     the previous pass left inside and outside (shot noise differs); quantisation is their floor.
     """
-    crop = _Crop.around(pixels, start, other)
-    x = _start_vector(start, blur_px)
+    crop = _Crop.around(pixels, start, foreground)
+    x = _start_vector(start)
     variances: tuple[float, float] | None = None
     result = NOT_MEASURED
     for _ in range(MAX_PASSES):
@@ -119,21 +127,24 @@ def fit_disc(
             return NOT_MEASURED
         if variances is None:
             x[BACKGROUND], x[CONTRAST] = band.levels()
-        free = x if _shortest_px(x) > SLOPE_RADIUS_BLURS * np.exp(x[BLUR]) else x[:CONTRAST_SLOPES]
-        fit = levenberg_marquardt(band.residuals, free, max_iterations=MAX_ITERATIONS)
+        free = x if _has_flat_middle(x) else x[:CONTRAST_SLOPES]
+        limit = FIRST_STEP_LIMIT if variances is None else STEP_LIMIT
+        fit = levenberg_marquardt(
+            band.residuals, free, max_iterations=MAX_ITERATIONS, step_limit=limit
+        )
         if not np.isfinite(fit.cost):
             return NOT_MEASURED
         # Settled: with weights from residuals, on a band that lies where the disc really is.
         settled = variances is not None and not _moved(x, fit.x)
         result = _result(fit, band, crop.origin, settled=settled)
-        if settled:
+        if settled or not (fit.converged or variances is None):
             break
         x = np.append(fit.x, np.zeros(x.size - fit.x.size))
         variances = band.variances_after(fit)
     return result
 
 
-# Parameters: centre x, y and shape xx, xy, yy as in `distance_terms`; logarithm of the blur;
+# Parameters: centre x, y and shape xx, xy, yy as in `distance_terms`; logarithm of the lens' blur;
 # background with two slopes; contrast with two slopes. Positions count from the start's centre.
 BLUR, BACKGROUND, CONTRAST, CONTRAST_SLOPES = 5, 6, 9, 10
 
@@ -148,7 +159,7 @@ class _Crop:
     to_other: FloatArray
 
     @classmethod
-    def around(cls, pixels: NDArray[Any], start: Ellipse, other: BoolArray | None) -> _Crop:
+    def around(cls, pixels: NDArray[Any], start: Ellipse, foreground: BoolArray | None) -> _Crop:
         """Cut out the disc and as much again around it, eight pixels at least."""
         a, _, _ = start.axes
         reach = a + max(a, 8.0)
@@ -158,12 +169,13 @@ class _Crop:
         values = pixels[window].astype(np.float64)
         rows, columns = np.indices(values.shape)
         xy = np.stack([columns + first[0], rows + first[1]], axis=-1) - start.centre
-        if other is None or not other[window].any():
-            to_other = np.full(values.size, np.inf)
-        else:
-            free = (~other[window]).astype(np.uint8)
-            distances = cv2.distanceTransform(free, cv2.DIST_L2, cv2.DIST_MASK_5)
-            to_other = distances.astype(np.float64).ravel()
+        to_other = np.full(values.size, np.inf)
+        if foreground is not None:
+            own = start.signed_distance(xy + start.centre) < OWN_EDGE_PX
+            free = (~foreground[window] | own).astype(np.uint8)
+            if not free.all():
+                distances = cv2.distanceTransform(free, cv2.DIST_L2, cv2.DIST_MASK_5)
+                to_other = distances.astype(np.float64).ravel()
         return cls(np.asarray(start.centre), xy.reshape(-1, 2), values.ravel(), to_other)
 
     def band(
@@ -171,7 +183,7 @@ class _Crop:
     ) -> _Band | None:
         """Choose the pixels along the edge; None if they cannot carry the parameters."""
         distance = distance_terms(x[:5], self.xy)[0]
-        blur = float(np.exp(x[BLUR]))
+        blur = _blur_px(x)
         at_edge = np.abs(distance) < 1
         gap = float(self.to_other[at_edge].min()) if at_edge.any() else 0.0
         chosen = np.abs(distance) <= BAND_BLURS * blur + BAND_FLAT_PX
@@ -204,7 +216,7 @@ class _Band:
         return background, float(np.median(self.values[self.inside >= high])) - background
 
     def residuals(self, x: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Weighted residuals and Jacobian; the last row is the usual blur."""
+        """Weighted residuals and Jacobian; the last row is the lens' usual blur."""
         model, jacobian = _grey_values(x, self.xy)
         if np.isfinite(self.full_scale):
             # E[min(value + noise, full scale)] and its slope
@@ -212,18 +224,17 @@ class _Band:
             unclipped = ndtr(-excess)
             model = model - self.std * (excess * (1 - unclipped) + _density(excess))
             jacobian = jacobian * unclipped[:, None]
-        blur_row = np.zeros(x.size)
-        blur_row[BLUR] = 1 / BLUR_LOG_STD
-        usual = (x[BLUR] - np.log(USUAL_BLUR_PX)) / BLUR_LOG_STD
-        return (
-            np.append((model - self.values) / self.std, usual),
-            np.vstack([jacobian / self.std[:, None], blur_row]),
-        )
+        rows = np.zeros((x.size, len(model) + 1))
+        rows[:, :-1] = jacobian.T / self.std
+        rows[BLUR, -1] = 1 / LENS_LOG_STD
+        usual = (x[BLUR] - np.log(USUAL_LENS_PX)) / LENS_LOG_STD
+        return np.append((model - self.values) / self.std, usual), rows.T
 
     def counted(self, fit: LeastSquaresFit) -> tuple[BoolArray, float]:
         """Return which pixels tell about noise, and the factor for the fitted parameters."""
-        model = _grey_values(fit.x, self.xy)[0]
-        kept = model < self.full_scale - 2 * self.std
+        kept = np.ones(len(self.values), dtype=bool)
+        if np.isfinite(self.full_scale):
+            kept = _grey_values(fit.x, self.xy)[0] < self.full_scale - 2 * self.std
         number = int(np.count_nonzero(kept))
         return kept, number / max(number + 1 - fit.x.size, 1)
 
@@ -262,24 +273,25 @@ def _grey_values(x: FloatArray, xy: FloatArray) -> tuple[FloatArray, FloatArray]
     if not abs(x[BLUR]) < LARGEST_LOG_BLUR:
         return np.full(len(xy), np.nan), np.full((len(xy), x.size), np.nan)
     distance, by_centre, by_shape, _ = distance_terms(x[:5], xy)
-    blur = np.exp(x[BLUR])
+    blur = _blur_px(x)
     t = distance / blur
     inside, density = ndtr(-t), _density(t)
-    terms = np.column_stack([np.ones(len(xy)), xy])
-    background = terms @ x[BACKGROUND:CONTRAST]
-    contrast_terms = terms[:, : x.size - CONTRAST]
-    contrast = contrast_terms @ x[CONTRAST:]
-    by_distance = (-contrast * density / blur)[:, None]
-    jacobian = np.hstack(
-        [
-            by_distance * by_centre,
-            by_distance * by_shape,
-            (contrast * density * t)[:, None],
-            terms,
-            contrast_terms * inside[:, None],
-        ]
-    )
-    return background + contrast * inside, jacobian
+    slopes = xy.T
+    background = x[BACKGROUND] + x[BACKGROUND + 1 : CONTRAST] @ slopes
+    contrast = np.full(len(xy), x[CONTRAST])
+    if x.size > CONTRAST_SLOPES:
+        contrast += x[CONTRAST_SLOPES:] @ slopes
+    edge = contrast * density
+    by_distance = edge / -blur
+    rows = np.empty((x.size, len(xy)))  # one parameter a row is quicker to fill
+    rows[:2] = by_distance * by_centre.T
+    rows[2:BLUR] = by_distance * by_shape.T
+    rows[BLUR] = edge * t * (1 - PIXEL_BLUR_PX2 / blur**2)
+    rows[BACKGROUND] = 1
+    rows[BACKGROUND + 1 : CONTRAST] = slopes
+    rows[CONTRAST] = inside
+    rows[CONTRAST_SLOPES:] = inside * slopes[: x.size - CONTRAST_SLOPES]
+    return background + contrast * inside, rows.T
 
 
 def _density(t: FloatArray) -> FloatArray:
@@ -298,20 +310,26 @@ def _first_variances(values: FloatArray, inside: FloatArray) -> tuple[float, flo
     return (found[0], found[-1]) if found else (1.0, 1.0)
 
 
-def _start_vector(start: Ellipse, blur_px: float) -> FloatArray:
+def _start_vector(start: Ellipse) -> FloatArray:
     (xx, xy), (_, yy) = start.shape
-    return np.array([0, 0, xx, xy, yy, np.log(blur_px), 0, 0, 0, 0, 0, 0], dtype=np.float64)
+    return np.array([0, 0, xx, xy, yy, np.log(USUAL_LENS_PX), 0, 0, 0, 0, 0, 0], dtype=np.float64)
 
 
 def _moved(before: FloatArray, after: FloatArray) -> bool:
     """Whether the band of `before` was misplaced by half a pixel, or its width by 15 %."""
     size = [np.array(axes_of_shape(*x[2:5])[:2]) for x in (before, after)]
     shifts = np.append(after[:2] - before[:2], size[1] - size[0])
-    return bool((np.abs(shifts) > 0.5).any() or abs(after[BLUR] - before[BLUR]) > 0.15)
+    return bool((np.abs(shifts) > 0.5).any() or abs(_blur_px(after) / _blur_px(before) - 1) > 0.15)
 
 
-def _shortest_px(x: FloatArray) -> float:
-    return axes_of_shape(*x[2:5])[1]
+def _blur_px(x: FloatArray) -> float:
+    """Blur of lens and pixel together."""
+    return float(np.sqrt(np.exp(2 * x[BLUR]) + PIXEL_BLUR_PX2))
+
+
+def _has_flat_middle(x: FloatArray) -> bool:
+    blur = max(_blur_px(x), USUAL_LENS_PX)
+    return axes_of_shape(*x[2:5])[1] > SLOPE_RADIUS_BLURS * blur
 
 
 def _result(fit: LeastSquaresFit, band: _Band, origin: FloatArray, *, settled: bool) -> DiscFit:
@@ -321,20 +339,61 @@ def _result(fit: LeastSquaresFit, band: _Band, origin: FloatArray, *, settled: b
     edge = np.abs(band.inside[kept] - 0.5) < 0.5 - FLAT_SHARE
     variances = band.variances_after(fit)
     # The weights' variances were floored by quantisation; the residuals may not undercut it.
+    floor = QUANTISATION_DN2 / min(variances)
     reduced = max(
+        factor * _at_leverage(fit, squares, kept),
         factor * float(squares.mean()) if squares.size else 1.0,
-        QUANTISATION_DN2 / min(variances),
+        floor,
     )
+    rough = _outline_roughness(fit, band)
     return DiscFit(
         xy_px=origin + fit.x[:2],
-        cov_px2=fit.covariance(reduced)[:2, :2],
+        cov_px2=fit.covariance(reduced if rough is None else max(rough, floor))[:2, :2],
         ellipse=axes_of_shape(*fit.x[2:5]),
-        blur_px=float(np.exp(fit.x[BLUR])),
+        blur_px=_blur_px(fit.x),
         contrast=float(fit.x[CONTRAST]),
         noise=float(np.sqrt(np.mean(variances))),
         reduced_residual=float(np.sqrt(factor * squares[edge].mean())) if edge.any() else 1.0,
         converged=fit.converged and settled,
     )
+
+
+def _outline_roughness(fit: LeastSquaresFit, band: _Band) -> float | None:
+    """Variance of the outline's slow undulations, in units of what white noise makes.
+
+    A shift of the centre is an undulation of order 1, which the fit absorbs as it does order 2.
+    Neighbouring pixels of real images are correlated (demosaicing, compression, the lens), and
+    then the orders that remain tell the variance of order 1 where single pixels tell too little.
+    Orders faster than the blur lets through are left out; None if too few are left.
+    """
+    a, b, angle = axes_of_shape(*fit.x[2:5])
+    highest = int(np.pi * (a + b) / ROUGHNESS_WAVE_PX)
+    dof = 2 * (highest - 2)
+    if dof < ROUGHNESS_DOF:
+        return None
+    x, y = (band.xy - fit.x[:2]).T
+    cos, sin = np.cos(angle), np.sin(angle)
+    around = np.arctan2((cos * y - sin * x) / b, (cos * x + sin * y) / a)
+    distance = distance_terms(fit.x[:5], band.xy)[0]
+    edge = _density(distance / _blur_px(fit.x)) / band.std
+    order = np.arange(3, highest + 1)[:, None]
+    waves = edge * np.concatenate([np.cos(order * around), np.sin(order * around)])
+    power = (waves @ fit.residuals[:-1]) ** 2 / np.sum(waves**2, axis=1)
+    # dof - 2: the inverse of a variance estimate is what weights use, and this is its mean
+    return float(power.sum() / (dof - 2))
+
+
+def _at_leverage(fit: LeastSquaresFit, squares: FloatArray, kept: BoolArray) -> float:
+    """Mean squared residual, each pixel weighed by its say in the centre.
+
+    On good images this is 1 as over all pixels; where the edge itself is rough, it tells.
+    """
+    covariance = fit.covariance()
+    if not np.isfinite(covariance).all():
+        return np.inf
+    say = ((fit.jacobian[:-1][kept] @ covariance[:, :2]) ** 2).sum(axis=1)
+    total = float(say.sum())
+    return float(say @ squares) / total if 0 < total < np.inf else np.inf
 
 
 _NAN2 = np.full(2, np.nan)

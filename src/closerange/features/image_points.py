@@ -116,6 +116,8 @@ class ImagePoints:
             return (value,) * count if isinstance(value, str) else tuple(value)
 
         def numbers(value: ArrayLike | None, shape: tuple[int, ...]) -> FloatArray:
+            if not count:  # an empty list has no columns
+                return np.empty(shape)
             return np.broadcast_to(
                 np.float64(np.nan) if value is None else np.asarray(value), shape
             )
@@ -186,7 +188,8 @@ class ImagePoints:
         ImagePoints
             The chosen rows in the given order.
         """
-        index = np.arange(len(self))[np.asarray(rows)]
+        chosen = np.asarray(rows)
+        index = np.arange(len(self))[chosen if chosen.size else slice(0)]  # [] has a float's type
         return ImagePoints(
             camera=tuple(self.camera[i] for i in index),
             placement=tuple(self.placement[i] for i in index),

@@ -29,10 +29,9 @@ def write_bytes(path: Path | str, content: bytes) -> None:
         If the folder is missing or not writable, or the disk is full.
     """
     path = Path(path)
-    if path.is_dir():
-        raise FileError(f"{path}: is a folder", remedy="name a file in it")
     temporary: str | None = None
     try:
+        _refuse_folder(path)
         handle, temporary = tempfile.mkstemp(
             prefix=f".{path.name}.", suffix=".part", dir=path.parent
         )
@@ -42,9 +41,12 @@ def write_bytes(path: Path | str, content: bytes) -> None:
             os.fsync(stream.fileno())
         Path(temporary).chmod(_mode_of_new_file(path))
         Path(temporary).replace(path)
-    except OSError as error:
+    except FileError:
+        raise
+    except (OSError, ValueError) as error:  # ValueError: a NUL byte in the path
+        reason = getattr(error, "strerror", None) or error
         raise FileError(
-            f"{path}: cannot be written ({error.strerror or error})",
+            f"{path}: cannot be written ({reason})",
             remedy="check that the folder exists, is writable and has room",
         ) from error
     finally:
@@ -69,6 +71,11 @@ def write_text(path: Path | str, text: str) -> None:
         As `write_bytes`.
     """
     write_bytes(path, text.encode("utf-8"))
+
+
+def _refuse_folder(path: Path) -> None:
+    if path.is_dir():
+        raise FileError(f"{path}: is a folder", remedy="name a file in it")
 
 
 def _mode_of_new_file(path: Path) -> int:

@@ -116,5 +116,6 @@ def sha256(path: Path | str) -> str:
     try:
         with Path(path).open("rb") as stream:
             return hashlib.file_digest(stream, "sha256").hexdigest()
-    except OSError as error:
-        raise FileError(f"{path}: {error.strerror or error}", remedy="check the path") from error
+    except (OSError, ValueError) as error:  # ValueError: a NUL byte in the path
+        reason = getattr(error, "strerror", None) or error
+        raise FileError(f"{path}: {reason}", remedy="check the path") from error

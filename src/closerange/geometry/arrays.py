@@ -37,8 +37,9 @@ def frozen_array(value: ArrayLike, shape: tuple[int | None, ...], name: str) -> 
         If the shape differs.
     """
     array = np.array(value, dtype=np.float64, order="C")
-    if array.size == 0 and len(shape) > 1 and array.ndim == 1:
-        array = array.reshape([0 if length is None else length for length in shape])
+    lengths = [0 if length is None else length for length in shape]
+    if array.size == 0 and array.ndim == 1 and 0 in lengths:
+        array = array.reshape(lengths)  # an empty list is no rows of any width
     return _checked(array, shape, name)
 
 

@@ -41,8 +41,8 @@ def intersect_linear(
     px = np.where(seen[:, :, None], ideal_px, 0.0)
     left = shifted[None, :, :2, :3] - px[..., None] * shifted[None, :, 2:, :3]
     right = px - shifted[None, :, :2, 3]
-    left = np.where(seen[:, :, None, None], left, 0.0).reshape(len(px), -1, 3)
-    right = np.where(seen[:, :, None], right, 0.0).reshape(len(px), -1)
+    left = np.where(seen[:, :, None, None], left, 0.0).reshape(len(px), 2 * len(matrices), 3)
+    right = np.where(seen[:, :, None], right, 0.0).reshape(len(px), 2 * len(matrices))
     normal = np.einsum("mri,mrj->mij", left, left)
     solvable = (seen.sum(axis=1) >= 2) & (_reciprocal_condition(normal) > 1e-14)
     normal[~solvable] = np.eye(3)

@@ -24,6 +24,13 @@ MIN_ANGLE_RAD = np.deg2rad(1.0)
 RESIDUAL_FALSE_ALARM = 1e-4
 """Chance that a good point is flagged for its residual."""
 
+MISSING_SHARE = 0.2
+"""Share of points with a large residual above which the rig is suspected, not the points: wrong
+pairs are rarer. Exchanged cameras of a symmetric pair give less than half."""
+
+MISSING_POINTS = 3
+"""Fewer points with a large residual may be chance blunders."""
+
 OUTSIDE_SIGMA = 3.0
 """A point counts as outside the volume when it is so by more than its own uncertainty."""
 
@@ -77,7 +84,6 @@ def measure_points(rig: Rig, points: ImagePoints) -> Positions:
         cameras=used,
         flags=flags,
         dof=None if observed.own_cov else rig.dof,
-        image_cov_mm2=solution.image_cov_mm2,
     )
 
 
@@ -142,7 +148,7 @@ def _rays_miss(rig: Rig, observed: Observed, solution: Solution) -> BoolArray:
 
 def _warn_if_rays_miss(rig: Rig, flags: IntArray, rms: FloatArray) -> None:
     missing = (flags & int(Flag.residual)) != 0
-    if len(flags) >= 3 and missing.mean() > 0.5:
+    if missing.sum() >= MISSING_POINTS and missing.mean() > MISSING_SHARE:
         warnings.warn(
             f"the rays of {int(missing.sum())} of {len(flags)} points miss each other by "
             f"{np.median(rms[missing]):.2f} px rms, the calibration left {rig.noise_px:.3f} px: a "

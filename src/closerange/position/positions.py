@@ -35,9 +35,6 @@ class Positions:
     dof : int or None
         Degrees of freedom of the variance behind `cov_mm2`; None when the covariances of the
         image points were given. A 95 % region is ``e' cov^-1 e <= 3 F(0.95; 3, dof)``.
-    image_cov_mm2 : ndarray, shape (M, 3, 3), or None
-        The part of `cov_mm2` that comes from the image points and differs between readings;
-        tables do not carry it.
     """
 
     placement: tuple[str, ...]
@@ -49,7 +46,6 @@ class Positions:
     flags: IntArray
     reading: tuple[str, ...]
     dof: int | None = None
-    image_cov_mm2: FloatArray | None = None
 
     def __post_init__(self) -> None:
         count = len(self.point)
@@ -62,9 +58,6 @@ class Positions:
         object.__setattr__(
             self, "residual_px", frozen_array(self.residual_px, (count,), "residual_px")
         )
-        if self.image_cov_mm2 is not None:
-            image = frozen_array(self.image_cov_mm2, (count, 3, 3), "image_cov_mm2")
-            object.__setattr__(self, "image_cov_mm2", image)
         object.__setattr__(self, "cameras", frozen_ints(self.cameras, (count,), "cameras"))
         object.__setattr__(self, "flags", frozen_ints(self.flags, (count,), "flags"))
 
@@ -83,7 +76,8 @@ class Positions:
 
     def select(self, rows: ArrayLike) -> Positions:
         """Keep some rows, by mask or index."""
-        index = np.arange(len(self))[np.asarray(rows)]
+        chosen = np.asarray(rows)
+        index = np.arange(len(self))[chosen if chosen.size else slice(0)]  # [] has a float's type
 
         def texts(values: Sequence[str]) -> tuple[str, ...]:
             return tuple(values[i] for i in index)
@@ -98,7 +92,6 @@ class Positions:
             flags=self.flags[index],
             reading=texts(self.reading),
             dof=self.dof,
-            image_cov_mm2=None if self.image_cov_mm2 is None else self.image_cov_mm2[index],
         )
 
     def to_csv(self, path: Path | str) -> None:

@@ -195,7 +195,7 @@ def analyse(
     turn, singular, vt = np.linalg.svd(upper)
     condition = float(singular[0] / max(singular[-1], np.finfo(float).tiny))
     if not condition < MAX_CONDITION:
-        raise _indistinct(view, free, vt[-1], condition)
+        raise _indistinct(view, free, vt[~(singular * MAX_CONDITION > singular[0])], condition)
     root = (vt.T / singular) / scale[:, None]
     # rows of the Jacobian are all x, then all y
     orthonormal = np.moveaxis((basis @ turn).reshape(2, len(view), -1), 0, 1)
@@ -237,9 +237,9 @@ def _about_origin(
 
 
 def _indistinct(
-    view: View, free: tuple[str, ...], direction: FloatArray, condition: float
+    view: View, free: tuple[str, ...], directions: FloatArray, condition: float
 ) -> GeometryError:
-    share = np.abs(direction)
+    share = np.linalg.norm(directions, axis=0)
     names = [free[i] for i in np.argsort(-share) if share[i] > 0.2 * share.max()]
     return GeometryError(
         f"camera {view.name!r}: the points cannot tell {', '.join(names)} apart (condition number "
@@ -277,6 +277,8 @@ def _descend(
         converged = fit.converged
         lens, rotation, shift = unpack(fit.x)
     camera = projector.camera(lens, rotation, shift)
+    # a lens polynomial that turns back within the points is no lens, however well it fits
+    converged = converged and bool(np.isfinite(camera.project(view.xyz_mm)).all())
     return analyse(view, camera, free, iterations=iterations, converged=converged)
 
 

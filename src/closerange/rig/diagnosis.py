@@ -5,7 +5,6 @@ from __future__ import annotations
 import re
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
-from itertools import combinations
 
 import numpy as np
 
@@ -13,7 +12,7 @@ from closerange.errors import GeometryError, InputError
 from closerange.features.control import ControlPoints
 from closerange.geometry.arrays import FloatArray, IntArray
 from closerange.rig.camera import Camera
-from closerange.rig.camera_fit import fit_camera
+from closerange.rig.camera_fit import CameraFit, fit_camera
 from closerange.rig.dlt import MIN_POINTS
 from closerange.rig.models import model_named
 from closerange.rig.observations import Observations
@@ -32,6 +31,10 @@ of labels lower it by tens to thousands; chance, and one lens term too few, by l
 
 TIED = 2.0
 """Explanations whose residuals differ by less than this factor cannot be told apart."""
+
+NAMED = 4
+"""Explanations named at most, the most frequent mistakes first; on flat parallel targets all
+mirrorings look alike."""
 
 ENOUGH = 0.8
 """Share of the points that must keep a known position under other labels."""
@@ -83,9 +86,8 @@ def explain_camera(
             found.append((noise, trial.words))
     if not found:
         return
-    found.sort()
-    best = found[0][0]
-    words = [words for noise, words in found if noise <= TIED * best]
+    best = min(noise for noise, _ in found)
+    words = [words for noise, words in found if noise <= TIED * best][:NAMED]
     before = f"falls from {found_px:.3g} px to" if np.isfinite(found_px) else "becomes"
     raise GeometryError(
         f"camera {observations.cameras[camera]!r}: the points do not belong to one view as they "
@@ -95,38 +97,76 @@ def explain_camera(
     )
 
 
-def explain_exchange(observations: Observations, found_px: FloatArray) -> None:
-    """Look for a placement whose image points went to each other's camera.
+def explain_placement(
+    observations: Observations, control: ControlPoints, camera: int, found_px: float
+) -> None:
+    """Look for one placement whose points were named wrongly or went to another camera.
 
     Parameters
     ----------
     observations : Observations
         All points.
-    found_px : ndarray, shape (C,)
-        Noise of each camera as things stand.
+    control : ControlPoints
+        Known positions.
+    camera : int
+        Index of the camera.
+    found_px : float
+        Its noise as things stand.
 
     Raises
     ------
     GeometryError
-        If exchanging two cameras in one placement lowers both residuals by `EXPLAINS`.
+        If the camera fits without the placement, and a mistake explains the placement's points.
     """
     placements = list(dict.fromkeys(observations.points.placement))
     if not 1 < len(placements) <= MAX_PLACEMENTS:
         return
-    for first, second in combinations(range(len(observations.cameras)), 2):
-        for placement in placements:
-            views = _exchanged(observations, first, second, placement)
-            before = np.hypot(found_px[first], found_px[second])
-            if not before > 0 or min(len(view) for view in views) < MIN_POINTS:
-                continue
-            after = np.hypot(*(_noise(view) for view in views))
-            if after * EXPLAINS < before:
-                a, b = observations.cameras[first], observations.cameras[second]
-                raise GeometryError(
-                    f"with cameras {a!r} and {b!r} exchanged in placement {placement!r} the "
-                    f"residual falls from {before:.3g} px to {after:.2g} px",
-                    remedy="name the cameras rightly in that placement",
-                )
+    everything = observations.view(camera, observations.points.xy_px)
+    names = [observations.points.placement[i] for i in observations.rows(camera)]
+    for placement in placements:
+        here = np.array([name == placement for name in names])
+        if here.all() or not here.any():
+            continue
+        rest = _quick_fit(everything.select(~here))
+        if rest is None or np.sqrt(rest.rss_px2 / rest.dof) * EXPLAINS > found_px:
+            continue
+        rows = observations.rows(camera)[here]
+        before = _median_miss(rest.camera, observations.xyz_mm[rows], observations, rows)
+        words, after = _best_words(observations, control, rest.camera, rows)
+        if after * EXPLAINS < before:
+            raise GeometryError(
+                f"camera {everything.name!r}, placement {placement!r}: with {words} in this "
+                f"placement the residual falls from {before:.3g} px to {after:.2g} px",
+                remedy="correct the names in that placement",
+            )
+
+
+def _best_words(
+    observations: Observations, control: ControlPoints, camera: Camera, rows: IntArray
+) -> tuple[str, float]:
+    """Return the mistake that explains the points of one image best, and the residual left."""
+    points = observations.points
+    found = [("nothing changed", float("inf"))]
+    for words, rename in relabellings(control):
+        known = control.rows_for(
+            [points.placement[i] for i in rows], [rename(points.point[i]) for i in rows]
+        )
+        if (known >= 0).all():
+            found.append((words, _median_miss(camera, control.xyz_mm[known], observations, rows)))
+    here = points.placement[rows[0]]
+    for index, name in enumerate(observations.cameras):
+        theirs = np.array([i for i in observations.rows(index) if points.placement[i] == here])
+        if name != camera.name and len(theirs):
+            miss = _median_miss(camera, observations.xyz_mm[theirs], observations, theirs)
+            found.append((f"the points of camera {name!r} (cameras exchanged)", miss))
+    return min(found, key=lambda pair: pair[1])
+
+
+def _median_miss(
+    camera: Camera, xyz_mm: FloatArray, observations: Observations, rows: IntArray
+) -> float:
+    miss = np.linalg.norm(observations.points.xy_px[rows] - camera.project(xyz_mm), axis=1)
+    return float(np.median(np.where(np.isfinite(miss), miss, np.inf)))
 
 
 def check_scale(observations: Observations, cameras: tuple[Camera, ...]) -> None:
@@ -171,14 +211,16 @@ def _trials(observations: Observations, control: ControlPoints, camera: int) -> 
     rows = observations.rows(camera)
     as_is = observations.view(camera, observations.points.xy_px)
     width, height = as_is.size_px
-    for words, relabel in _relabellings(observations, control):
+    relabelled = []
+    for words, relabel in relabellings(control):
         names = [relabel(observations.points.point[i]) for i in rows]
         placements = [observations.points.placement[i] for i in rows]
         known = control.rows_for(placements, names)
         if np.count_nonzero(known >= 0) >= max(ENOUGH * len(rows), MIN_POINTS):
             kept = as_is.select(known >= 0)
             xyz = control.xyz_mm[known[known >= 0]]
-            yield _Trial(words, View(kept.name, kept.size_px, xyz, kept.xy_px))
+            relabelled.append(_Trial(words, View(kept.name, kept.size_px, xyz, kept.xy_px)))
+    yield from relabelled[:2]
     yield _Trial(
         "the control axes mirrored (they are left-handed)",
         View(as_is.name, as_is.size_px, as_is.xyz_mm * [1, 1, -1], as_is.xy_px),
@@ -187,18 +229,28 @@ def _trials(observations: Observations, control: ControlPoints, camera: int) -> 
         "x_px and y_px exchanged",
         View(as_is.name, (height, width), as_is.xyz_mm, as_is.xy_px[:, ::-1]),
     )
+    yield from relabelled[2:]
     flipped = np.column_stack([as_is.xy_px[:, 0], height - 1 - as_is.xy_px[:, 1]])
     yield _Trial(
         "y_px counted from the other edge", View(as_is.name, as_is.size_px, as_is.xyz_mm, flipped)
     )
 
 
-def _relabellings(
-    observations: Observations, control: ControlPoints
-) -> Iterator[tuple[str, Callable[[str], str]]]:
-    """Mistakes of a grid's labels r{r}c{c}; none if the names are of another kind."""
+def relabellings(control: ControlPoints) -> Iterator[tuple[str, Callable[[str], str]]]:
+    """List the mistakes that are made with a grid's labels ``r{r}c{c}``.
+
+    Parameters
+    ----------
+    control : ControlPoints
+        Whose names tell the size of the grid.
+
+    Yields
+    ------
+    words, rename : str, callable
+        What was mistaken, and the right name of a wrong one; nothing for names of another kind.
+    """
     cells = [match for name in control.point if (match := _GRID.fullmatch(name))]
-    if 2 * len(cells) < len(control.point) or not observations.points.point:
+    if not cells or 2 * len(cells) < len(control.point):
         return
     last_row = max(int(cell[1]) for cell in cells)
     last_column = max(int(cell[2]) for cell in cells)
@@ -230,35 +282,17 @@ def _relabellings(
     )
 
 
-def _exchanged(
-    observations: Observations, first: int, second: int, placement: str
-) -> tuple[View, View]:
-    here = np.array([name == placement for name in observations.points.placement])
-
-    def rows(keep: int, take: int) -> IntArray:
-        mine = (observations.camera == keep) & ~here
-        theirs = (observations.camera == take) & here
-        return np.flatnonzero(observations.usable & (mine | theirs)).astype(np.int64)
-
-    def view(camera: int, index: IntArray) -> View:
-        name = observations.cameras[camera]
-        return View(
-            name,
-            observations.size_px[name],
-            observations.xyz_mm[index],
-            observations.points.xy_px[index],
-        )
-
-    return view(first, rows(first, second)), view(second, rows(second, first))
-
-
-def _noise(view: View) -> float:
-    """Noise of a quick fit, infinite where there is none."""
+def _quick_fit(view: View) -> CameraFit | None:
     model = model_named("brown")
     if not model.affordable(len(view)):
         model = model_named("pinhole")
     try:
-        fit = fit_camera(view, model.free)
+        return fit_camera(view, model.free)
     except GeometryError:
-        return float("inf")
-    return float(np.sqrt(fit.rss_px2 / fit.dof))
+        return None
+
+
+def _noise(view: View) -> float:
+    """Noise of a quick fit, infinite where there is none."""
+    fit = _quick_fit(view)
+    return float("inf") if fit is None else float(np.sqrt(fit.rss_px2 / fit.dof))

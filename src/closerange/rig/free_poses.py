@@ -7,6 +7,7 @@ placements are adjusted together.
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import Any
@@ -19,10 +20,11 @@ from closerange.features.control import ControlPoints
 from closerange.features.image_points import ImagePoints
 from closerange.geometry.arrays import FloatArray, IntArray
 from closerange.geometry.least_squares import levenberg_marquardt
-from closerange.geometry.transform import RigidTransform, cross_matrix, rotation_from_vector
+from closerange.geometry.transform import RigidTransform, rotation_from_vector
 from closerange.rig.camera import POSE, Camera
 from closerange.rig.distortion import BrownIdeal
 from closerange.rig.models import FREE, model_named
+from closerange.rig.projector import left_jacobian
 from closerange.rig.rig import Residuals, Rig
 
 MIN_POINTS = 6
@@ -102,6 +104,9 @@ def _join(
 ) -> _Views:
     row = control.rows_of(points)
     usable = points.found & (row >= 0) & (points.flags == 0)
+    pairs = list(zip(points.camera, points.placement, strict=True))
+    counts = Counter(pair for pair, good in zip(pairs, usable, strict=True) if good)
+    usable &= np.array([counts[pair] >= MIN_POINTS for pair in pairs], dtype=bool)
     kept, row = points.select(usable), row[usable]
     missing = [camera for camera in kept.cameras if camera not in size_px]
     if missing:
@@ -109,7 +114,9 @@ def _join(
             f"the image size of camera {missing[0]!r} is not known",
             remedy=f"add --image-size {missing[0]}=WxH",
         )
-    cameras = kept.cameras
+    cameras = points.cameras  # one without usable points is named below, not dropped
+    if not cameras:
+        raise GeometryError("there are no image points", remedy="detect the target first")
     placements = tuple(dict.fromkeys(kept.placement))
     camera = np.array([cameras.index(name) for name in kept.camera], dtype=np.int64)
     index = {name: i for i, name in enumerate(placements)}
@@ -219,9 +226,9 @@ class _Bundle:
         ]
         turns = x[width * len(cameras) :].reshape(-1, 6)
         poses = [self.poses[0]]
-        for pose, (*turn, a, b, c) in zip(self.poses[1:], turns, strict=True):
-            rotation = rotation_from_vector(turn)
-            poses.append(RigidTransform(rotation @ pose.rotation, pose.translation_mm + [a, b, c]))
+        for pose, change in zip(self.poses[1:], turns, strict=True):
+            rotation = rotation_from_vector(change[:3]) @ pose.rotation
+            poses.append(RigidTransform(rotation, pose.translation_mm + change[3:]))
         return _Bundle(self.views, cameras, poses, self.free)
 
     def world_mm(self) -> FloatArray:
@@ -255,11 +262,7 @@ class _Bundle:
             for j, pose in enumerate(self.poses[1:], start=1):
                 chosen = self.views.placement[rows] == j
                 arms = world[rows[chosen]] - pose.translation_mm
-                turned = (
-                    by_point[chosen] @ -np.stack([cross_matrix(arm) for arm in arms])
-                    if len(arms)
-                    else np.zeros((0, 2, 3))
-                )
+                turned = np.cross(arms[:, None, :], by_point[chosen])  # row . -[a]x = a x row
                 start = width * len(self.cameras) + 6 * (j - 1)
                 full[rows[chosen], :, start : start + 3] = turned
                 full[rows[chosen], :, start + 3 : start + 6] = by_point[chosen]
@@ -320,18 +323,8 @@ def _turns_as_added(x: FloatArray, bundle: _Bundle) -> FloatArray:
     starts = [i * width + bundle.free.index("rx") for i in range(len(bundle.cameras))]
     starts += list(range(width * len(bundle.cameras), len(x), 6))
     for start in starts:
-        change[start : start + 3, start : start + 3] = _left_jacobian(x[start : start + 3])
+        change[start : start + 3, start : start + 3] = left_jacobian(x[start : start + 3])
     return change
-
-
-def _left_jacobian(vector: FloatArray) -> FloatArray:
-    """Return J with exp(v + d) = exp(J d) exp(v) to first order in d."""
-    angle = float(np.linalg.norm(vector))
-    cross = cross_matrix(vector)
-    first = 0.5 if angle < 1e-4 else (1 - np.cos(angle)) / angle**2
-    second = 1 / 6 if angle < 1e-4 else (angle - np.sin(angle)) / angle**3
-    jacobian: FloatArray = np.eye(3) + first * cross + second * (cross @ cross)
-    return jacobian
 
 
 def _report(state: _Bundle, cov: FloatArray, converged: bool, model: str) -> dict[str, Any]:

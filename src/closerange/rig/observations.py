@@ -13,6 +13,8 @@ from closerange.features.control import ControlPoints
 from closerange.features.image_points import ImagePoints
 from closerange.flags import Flag, format_flags
 from closerange.geometry.arrays import BoolArray, FloatArray, IntArray
+from closerange.rig.camera import Camera
+from closerange.rig.disc_bias import DiscViews, disc_centre_bias
 from closerange.rig.dlt import MIN_POINTS
 from closerange.rig.view import View
 
@@ -140,6 +142,36 @@ def join(
     )
     _require_enough(observations)
     return observations
+
+
+def without_disc_bias(observations: Observations, cameras: Sequence[Camera]) -> FloatArray:
+    """Return where the centres of discs would be seen, instead of the centres of their images.
+
+    Parameters
+    ----------
+    observations : Observations
+        Rows; those with an ellipse in two cameras are corrected.
+    cameras : sequence of Camera
+        Calibrated well enough to tell the attitude of discs, in the order of the observations.
+
+    Returns
+    -------
+    ndarray, shape (N, 2)
+        Image positions in px; see `disc_bias`.
+    """
+    points = observations.points
+    keys = list(zip(points.placement, points.reading, points.point, strict=True))
+    index = {key: i for i, key in enumerate(dict.fromkeys(keys))}
+    disc = np.array([index[key] for key in keys], dtype=np.int64)
+    xyz = np.zeros((len(index), 3))
+    ellipse = np.full((len(index), len(cameras), 3), np.nan)
+    diameter = np.full(len(index), np.nan)
+    xyz[disc] = observations.xyz_mm
+    ellipse[disc, observations.camera] = points.ellipse
+    diameter[disc] = points.disc_diameter_mm
+    bias = disc_centre_bias(cameras, DiscViews(xyz, ellipse, diameter))
+    corrected: FloatArray = points.xy_px - bias[disc, observations.camera]
+    return corrected
 
 
 def listed(names: Sequence[str]) -> str:

@@ -39,8 +39,12 @@ MAX_SHARE = 0.5
 ROUNDING_PX = 1e-6
 """Smallest noise that is told from rounding: exact data have no blunders below it."""
 
+CONSISTENT = 0.7
+"""Share of points explained by a robust fit that makes a second start needless."""
+
 REWEIGHTINGS = 15
 STEPS_PER_REWEIGHTING = 4  # the weights change again before more would pay
+SETTLED = 0.01  # relative change of the variance; the limit above is no finer
 EXCHANGES = 50
 
 Fitter: TypeAlias = Callable[[View, Camera | None], CameraFit]
@@ -57,10 +61,13 @@ class CleanFit:
         Of the points kept.
     kept : ndarray of bool, shape (N,)
         Points that took part.
+    plain_px : float
+        Noise of the fit of all points.
     """
 
     fit: CameraFit
     kept: BoolArray
+    plain_px: float
 
 
 def fit_without_blunders(
@@ -86,17 +93,18 @@ def fit_without_blunders(
     """
     everything = np.ones(len(view), dtype=bool)
     plain = fitter(view, None)
+    plain_px = float(np.sqrt(plain.rss_px2 / plain.dof))
     hidden = _noise(plain) > HIDDEN * _inner_noise(plain.whitened, plain.dof)
     if not hidden and (snoop(plain) <= limit(plain.dof - 2, trials)).all():
-        return CleanFit(plain, everything)
+        return CleanFit(plain, everything, plain_px)
     kept = _sorted_robustly(view, plain, robust_free) if hidden else everything
     try:
-        clean = _exchange(view, fitter, kept, trials)
+        fit, kept = _exchange(view, fitter, kept, trials)
     except GeometryError:  # too little is left to carry the parameters
-        return CleanFit(plain, everything)
-    if np.count_nonzero(~clean.kept) > MAX_SHARE * len(view):
-        return CleanFit(plain, everything)
-    return clean
+        return CleanFit(plain, everything, plain_px)
+    if np.count_nonzero(~kept) > MAX_SHARE * len(view):
+        return CleanFit(plain, everything, plain_px)
+    return CleanFit(fit, kept, plain_px)
 
 
 def snoop(fit: CameraFit) -> FloatArray:
@@ -178,7 +186,9 @@ def predicted(fit: CameraFit, view: View) -> FloatArray:
     return statistic
 
 
-def _exchange(view: View, fitter: Fitter, kept: BoolArray, trials: int) -> CleanFit:
+def _exchange(
+    view: View, fitter: Fitter, kept: BoolArray, trials: int
+) -> tuple[CameraFit, BoolArray]:
     """Take back what fits, leave out the worst that does not, until neither is there."""
     seen: set[bytes] = set()
     start: Camera | None = None
@@ -198,7 +208,7 @@ def _exchange(view: View, fitter: Fitter, kept: BoolArray, trials: int) -> Clean
             break
         seen.add(kept.tobytes())
         kept = changed
-    return CleanFit(fit, kept)
+    return fit, kept
 
 
 def _sorted_robustly(view: View, plain: CameraFit, free: tuple[str, ...]) -> BoolArray:
@@ -216,6 +226,8 @@ def _sorted_robustly(view: View, plain: CameraFit, free: tuple[str, ...]) -> Boo
         variance = max(_inner_variance(square, view.xy_px.size - len(free)), ROUNDING_PX**2)
         if variance < best:
             best, kept = variance, np.asarray(square <= ROBUST_LIMIT * variance)
+        if np.mean(kept) > CONSISTENT:
+            break
     return kept
 
 
@@ -225,13 +237,16 @@ def _robust_squares(view: View, free: tuple[str, ...], start: Camera) -> FloatAr
     Cauchy's pull every point a little, so that the search does not stick; the others forget a
     blunder altogether.
     """
-    camera, early = start, REWEIGHTINGS // 3
+    camera, early, last = start, REWEIGHTINGS // 3, np.inf
     square = _squares(view, camera)
     for step in range(REWEIGHTINGS):
         stage = strong_parameters(free) if step < early else free
         variance = max(_inner_variance(square, view.xy_px.size - len(stage)), ROUNDING_PX**2)
         if not np.isfinite(variance):
             raise GeometryError(f"camera {view.name!r}: the points do not belong to one view")
+        if step > early + 1 and abs(variance - last) <= SETTLED * last:
+            break
+        last = variance
         # four variances: a Gaussian residual keeps most of its weight
         weight = 1 / (1 + square / (4 * variance)) ** (1 if step < early else 2)
         fit = fit_camera(
@@ -245,7 +260,8 @@ def _robust_squares(view: View, free: tuple[str, ...], start: Camera) -> FloatAr
 def _squares(view: View, camera: Camera) -> FloatArray:
     residual = view.xy_px - camera.project(view.xyz_mm)
     white, _ = whiten(view.whitener, residual.T, np.zeros((0, 2, len(view))))
-    return np.nan_to_num(np.sum(white**2, axis=0), nan=np.inf)
+    square = np.sum(white**2, axis=0)
+    return np.where(np.isfinite(square), square, np.inf)
 
 
 def _reweighted(view: View, weight: FloatArray) -> View:

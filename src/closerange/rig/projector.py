@@ -55,7 +55,9 @@ class Projector:
         fx, fy, cx, cy, skew, k1, k2, k3, p1, p2 = lens
         turned = rotation @ self.centred
         depth = turned[2] + shift[2]
-        per_depth = 1.0 / np.where(depth > 0, depth, np.nan)
+        # NaN makes the search step back: points behind the camera, mirrored images
+        valid = (depth > 0) & bool(fx > 0 and fy > 0)
+        per_depth = 1.0 / np.where(valid, depth, np.nan)
         x, y = (turned[0] + shift[0]) * per_depth, (turned[1] + shift[1]) * per_depth
         xx, yy, xy2 = x * x, y * y, 2 * x * y
         r2 = xx + yy

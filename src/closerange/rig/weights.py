@@ -83,15 +83,17 @@ def common_variance(residual_px: FloatArray, cov_px2: FloatArray, dof: int) -> f
     values, vectors = np.linalg.eigh(cov_px2)
     square = np.einsum("nij,ni->nj", vectors, residual_px) ** 2
     values = np.maximum(values, 0.0)
+    floor = max(1e-12 * float(values.max(initial=0.0)), np.finfo(float).tiny)
 
     def excess(tau2: float) -> float:
-        return float(np.sum(square / np.maximum(values + tau2, np.finfo(float).tiny))) - dof
+        # a value of zero is rounding or an exact point: it must not overflow
+        return float(np.sum(square / np.maximum(values + tau2, floor))) - dof
 
     low, high = 0.0, float(np.sum(square)) / dof
-    if high == 0 or excess(0.0) <= 0:
-        return 0.0
     if not values.any():
         return high
+    if excess(0.0) <= 0:
+        return 0.0
     for _ in range(_HALVINGS):
         middle = (low + high) / 2
         low, high = (middle, high) if excess(middle) > 0 else (low, middle)

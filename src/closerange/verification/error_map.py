@@ -99,6 +99,25 @@ def judged_volume(volume_mm: FloatArray) -> FloatArray:
     return np.stack([middle - widened / 2, middle + widened / 2])
 
 
+def seen_by(rig: Rig, xyz_mm: FloatArray) -> BoolArray:
+    """Tell which points lie inside of which images.
+
+    Parameters
+    ----------
+    rig : Rig
+        C cameras.
+    xyz_mm : ndarray, shape (M, 3)
+        World points; whether something hides them is not asked.
+
+    Returns
+    -------
+    ndarray of bool, shape (M, C)
+        False behind a camera too.
+    """
+    pixels = np.stack([camera.project(xyz_mm) for camera in rig.cameras], axis=1)
+    return _inside_images(rig, pixels)
+
+
 def _inside_images(rig: Rig, pixels: FloatArray) -> BoolArray:
     """Return which projections lie inside the images, shape (M, C)."""
     sizes = np.array([camera.size_px for camera in rig.cameras], dtype=np.float64)

@@ -6,7 +6,7 @@ import numpy as np
 
 from closerange.geometry.arrays import FloatArray
 from closerange.rig.rig import Rig, Trust
-from closerange.verification.error_map import ErrorMap, judged_volume, predict_errors
+from closerange.verification.error_map import ErrorMap, judged_volume, predict_errors, seen_by
 
 CALIBRATION_SHARE = 3.0
 """Untrustworthy when the calibration contributes more than three times what one reading does:
@@ -44,7 +44,11 @@ def judge_rig(rig: Rig, *, volume_given: bool = False) -> Trust:
     volume = rig.volume_mm if volume_given else judged_volume(rig.volume_mm)
     errors = predict_errors(rig, volume)
     total, calibration = _rms(errors.std_mm), _rms(errors.calibration_std_mm)
-    grave = [*_convergence(rig), *_grave(errors, total, calibration, volume)]
+    grave = [
+        *_convergence(rig),
+        *_coverage(rig, errors),
+        *_grave(errors, total, calibration, volume),
+    ]
     light = _light(rig, errors, total, calibration)
     verdict = "untrustworthy" if grave else "fair" if light else "good"
     return Trust(verdict, total, calibration, tuple(grave + light))
@@ -55,7 +59,7 @@ def _grave(
 ) -> list[str]:
     if not np.isfinite(total).all():
         if not np.isfinite(errors.std_mm).any():
-            return []  # one camera only: nothing to judge
+            return []  # one camera only, or none sees the volume: see `_coverage`
         return ["the predicted error is not finite: add control points off their common plane"]
     reasons = []
     image = np.sqrt(np.maximum(total**2 - calibration**2, 0.0))
@@ -74,6 +78,20 @@ def _grave(
             "placements and cameras are named rightly"
         )
     return reasons
+
+
+def _coverage(rig: Rig, errors: ErrorMap) -> list[str]:
+    """Report a volume that no two cameras see; one camera alone measures no positions."""
+    views = seen_by(rig, errors.xyz_mm).sum(axis=1)
+    if len(rig.cameras) < 2 or (views >= 2).any():
+        return []
+    lower, upper = errors.xyz_mm.min(axis=0), errors.xyz_mm.max(axis=0)
+    return [
+        (
+            f"no part of the volume {lower.tolist()} to {upper.tolist()} mm is seen by two "
+            "cameras: turn the cameras, or state the --volume that they see"
+        )
+    ]
 
 
 def _light(rig: Rig, errors: ErrorMap, total: FloatArray, calibration: FloatArray) -> list[str]:

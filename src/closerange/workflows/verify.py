@@ -65,13 +65,7 @@ def verify(
         return length_test(positions, _lengths(truth))
     control = _control(truth)
     if kind == "single-point":
-        return single_point_test(
-            positions,
-            control,
-            limits=limits,
-            cycle_time_s=cycle_time_s,
-            noise_cov_mm2=positions.image_cov_mm2,
-        )
+        return single_point_test(positions, control, limits=limits, cycle_time_s=cycle_time_s)
     if kind == "control":
         return _control_check(positions, control, rig)
     raise InputError(f"kind {kind!r} of verification", remedy=f"known kinds are {', '.join(KINDS)}")
