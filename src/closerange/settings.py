@@ -217,8 +217,11 @@ def inside(settings: Settings, relative: str) -> Path:
             f"{relative}: leaves the project's folder", remedy="put the file below the project file"
         )
     path = settings.folder / written
-    root = settings.folder.resolve()
-    if not path.resolve().is_relative_to(root):
+    try:
+        within = path.resolve().is_relative_to(settings.folder.resolve())
+    except (OSError, RuntimeError, ValueError) as error:  # a loop of links, a NUL byte
+        raise FileError(f"{relative!r}: {error}", remedy="correct the path") from error
+    if not within:
         raise FileError(
             f"{relative}: a symbolic link leaves the project's folder",
             remedy="put the file itself below the project file",
@@ -248,8 +251,9 @@ def images_of(settings: Settings, patterns: list[str]) -> list[Path]:
     """
     found: list[Path] = []
     for pattern in patterns:
-        folder = inside(settings, str(Path(pattern).parent))
-        matches = sorted(folder.glob(Path(pattern).name)) if folder.is_dir() else []
+        inside(settings, pattern)  # its message shows the pattern as it is written
+        folder, name = inside(settings, str(Path(pattern).parent)), Path(pattern).name
+        matches = sorted(folder.glob(name)) if name and folder.is_dir() else []
         if not matches:
             raise FileError(f"{pattern}: no such file in the project", remedy="correct the pattern")
         found.extend(inside(settings, str(match.relative_to(settings.folder))) for match in matches)

@@ -44,7 +44,7 @@ def yaml_with_tags(path, fuse):
     )
 
 
-def opencv_yaml(path, fuse):
+def opencv_yaml(path, _fuse):
     path.write_text("%YAML:1.0\n---\nm: !!opencv-matrix\n   rows: 3\n", encoding="utf-8")
 
 
@@ -87,10 +87,10 @@ def test_item_45_files_that_could_execute_are_not_read(tables, refused, tmp_path
         ('{"schema": "closerange.rig/1", "noise_px": -Infinity}', "Infinity"),
         ('{"schema": "closerange.rig/1", "dof": 1' + "0" * 5000 + "}", "digits"),
         ('{"schema": "closerange.rig/1"', "line 1"),
-        ("[]", "list"),
-        ("3", "number"),
-        ("null", ""),
-        ('"closerange.rig/1"', "text"),
+        ("[]", "schema"),
+        ("3", "schema"),
+        ("null", "schema"),
+        ('"closerange.rig/1"', "schema"),
         ("{}", "schema"),
     ],
 )
@@ -223,10 +223,11 @@ def test_item_49_rig_that_is_a_device_or_a_pipe(tables, refused, special):
 
 @pytest.fixture
 def project(demo_data, tmp_path):
-    """Copy the calibration of the demo as a project of its own: no jobs, 14 images."""
+    """Copy two placements of the demo's calibration as a project of its own, without jobs."""
     folder = tmp_path / "project"
-    folder.mkdir()
-    shutil.copytree(demo_data / "calibration", folder / "calibration")
+    (folder / "calibration").mkdir(parents=True)
+    for image in (demo_data / "calibration").glob("*_z?50.0.png"):
+        shutil.copy(image, folder / "calibration")
     for name in ("plate.toml", "control.csv"):
         shutil.copy(demo_data / name, folder)
     text = (demo_data / "closerange.toml").read_text(encoding="utf-8")
@@ -274,6 +275,17 @@ def test_item_49_paths_that_leave_the_project(project, run, unsafe, key):
     path.write_text(changed, encoding="utf-8")
     run_refused(run, project, 2, unsafe, "project")
     assert outside.read_text(encoding="utf-8") == "secret\n"
+
+
+@pytest.mark.parametrize("odd", ["\\u0000", "loop", ".", "calibration", "/", "~/x.csv", "$HOME/x"])
+@pytest.mark.parametrize("key", ["target", "control", "images"])
+def test_item_49_paths_that_are_none(project, run, odd, key):
+    (project / "loop").symlink_to(project / "loop")
+    path = project / "closerange.toml"
+    text = path.read_text(encoding="utf-8")
+    old = {"target": "plate.toml", "control": "control.csv", "images": "calibration/left_*.png"}
+    path.write_text(text.replace(old[key], odd), encoding="utf-8")
+    run_refused(run, project, 2)
 
 
 @pytest.mark.parametrize(

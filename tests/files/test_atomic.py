@@ -30,6 +30,12 @@ def test_text_keeps_line_ends_and_unicode(tmp_path):
     assert (tmp_path / "t.csv").read_bytes() == "Grüße\r\nµm\n".encode()
 
 
+def test_half_a_character_from_a_badly_encoded_file_name(tmp_path):
+    with pytest.raises(FileError, match="cannot be written as UTF-8"):
+        write_text(tmp_path / "t.csv", "placement,\udce4\n")
+    assert names(tmp_path) == []
+
+
 def test_missing_folder(tmp_path):
     with pytest.raises(FileError, match="cannot be written") as caught:
         write_bytes(tmp_path / "none" / "t.csv", b"x")

@@ -25,7 +25,7 @@ def random_transform():
 def test_rodrigues_is_opencv_s(angle):
     vector = angle * np.array([1.0, -2.0, 2.0]) / 3
     rotation = rotation_from_vector(vector)
-    # measured 4e-16
+    # measured 7e-16
     np.testing.assert_allclose(rotation, cv2.Rodrigues(vector)[0], atol=1e-14)
     np.testing.assert_allclose(rotation @ rotation.T, np.eye(3), atol=1e-14)
 

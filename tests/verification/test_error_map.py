@@ -42,7 +42,7 @@ def test_without_parameters_only_the_image_errs():
     # across the base s / (sqrt(2) cos), along the depth s / (sqrt(2) sin), upwards s / sqrt(2)
     ray = rig.noise_px * 350 / 1300
     expected = ray / np.sqrt(2) / [np.cos(np.radians(20)), 1, np.sin(np.radians(20))]
-    np.testing.assert_allclose(middle, expected, rtol=0.01)  # measured 0.1 %
+    np.testing.assert_allclose(middle, expected, rtol=1e-9)  # measured 2e-16
 
 
 def test_noise_scales_the_prediction():
@@ -59,11 +59,12 @@ def test_prediction_is_the_cramer_rao_bound_of_the_true_rig(scene):
     total, calibration = position_bound(
         scene.cameras, BROWN, control_grid(63).xyz_mm, errors.xyz_mm, rig.noise_px
     )
-    # the noise is the estimated one on both sides; the rest is the parameters' own error.
+    # The noise is the estimated one on both sides; the rest is the parameters' own error.
+    # Measured 1.4 % and 7.8 % (A, a nearly affine view), 0.1 % and 0.5 % (B).
     expected = np.sqrt(np.einsum("mii->mi", total))
     np.testing.assert_allclose(errors.std_mm, expected, rtol=0.03)
     expected = np.sqrt(np.einsum("mii->mi", calibration))
-    np.testing.assert_allclose(errors.calibration_std_mm, expected, rtol=0.1)
+    np.testing.assert_allclose(errors.calibration_std_mm, expected, rtol=0.15)
 
 
 def test_prediction_is_what_repeated_calibrations_scatter_by():
@@ -80,7 +81,8 @@ def test_prediction_is_what_repeated_calibrations_scatter_by():
         points = observe(scene.cameras, truth, noise_px=scene.noise_px, rng=rng)
         errors[draw] = measure_points(rig, points).xyz_mm - nodes
     ratio = np.sqrt(np.mean(errors**2, axis=0)) / predicted.std_mm
-    # 40 draws know a standard deviation to 11 % and s of the prediction is known to 8 %
+    # 40 draws know a standard deviation to 11 % and s of the prediction is known to 8 %;
+    # measured 1.09 on average, 0.83 to 1.35
     assert ratio.mean() == pytest.approx(1, abs=0.2)
     assert (ratio > 0.5).all()
     assert (ratio < 1.6).all()

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from closerange.errors import GeometryError
+from closerange.errors import CloseRangeWarning, GeometryError
 from closerange.rig.calibrate import calibrate_rig
 from closerange.verification.error_map import predict_errors
 from closerange.verification.scenes import control_grid, observe, rig_a, rig_b
@@ -59,9 +59,11 @@ def test_points_that_are_nearly_in_one_plane_are_not_trusted():
     assert (stated.predicted_mm < trust.predicted_mm).all()
 
 
-def test_a_hundred_fold_noise_is_not_trusted():
+def test_a_four_hundred_fold_noise_is_not_trusted():
     """20 px: a wrong pairing of points leaves residuals like these."""
-    trust = judge_rig(calibrated(rig_b(), noise_px=20.0, model="pinhole"))
+    with pytest.warns(CloseRangeWarning, match="residuals are"):
+        rig = calibrated(rig_b(), noise_px=20.0, model="pinhole")
+    trust = judge_rig(rig)
     assert trust.verdict == "untrustworthy"
     assert any("limit 2 %" in reason and "named rightly" in reason for reason in trust.reasons)
 
@@ -99,6 +101,14 @@ def test_a_volume_that_the_cameras_do_not_see_is_fair():
     assert any("seen by fewer than two cameras" in reason for reason in trust.reasons)
 
 
+def test_a_volume_that_no_two_cameras_see_is_not_trusted():
+    """Nothing can be predicted there, nor measured: a wrong --volume."""
+    rig = replace(calibrated(rig_b()), volume_mm=np.array([[900.0, 900, 0], [950.0, 950, 50]]))
+    trust = judge_rig(rig, volume_given=True)
+    assert trust.verdict == "untrustworthy"
+    assert "seen by two cameras" in trust.reasons[0]
+
+
 def test_one_camera_alone_is_judged_without_a_figure():
     rig = calibrated(rig_b())
     names, places = rig.parameters_of("left")
@@ -117,4 +127,6 @@ def test_an_infinite_covariance_is_not_trusted():
     rig = calibrated(rig_b())
     cov = rig.parameter_cov.copy()
     cov[0, 0] = np.inf
-    assert judge_rig(replace(rig, parameter_cov=cov)).verdict == "untrustworthy"
+    trust = judge_rig(replace(rig, parameter_cov=cov))
+    assert trust.verdict == "untrustworthy"
+    assert "not finite" in trust.reasons[0]

@@ -40,9 +40,9 @@ IMAGINED_PIXELS = 2
 ROUGHNESS_WAVE_PX, ROUGHNESS_DOF = 6.0, 8
 # A blur beyond 0.02 .. 50 px is not what this model describes.
 LARGEST_LOG_BLUR = 4.0
-# A step of this share of all grey values over their noise (some thousands) is a hundredth of a
-# standard deviation; the first pass only places the band and the weights.
-FIRST_STEP_LIMIT, STEP_LIMIT = 1e-4, 1e-6
+# What a last step could still gain, as a share of the cost: of a hundred pixels' residuals, 1e-6
+# is a hundredth of a standard deviation. The first pass only places the band and the weights.
+FIRST_GAIN_LIMIT, GAIN_LIMIT = 1e-4, 1e-6
 MAX_PASSES = 4
 MAX_ITERATIONS = 30
 
@@ -128,9 +128,9 @@ def fit_disc(
         if variances is None:
             x[BACKGROUND], x[CONTRAST] = band.levels()
         free = x if _has_flat_middle(x) else x[:CONTRAST_SLOPES]
-        limit = FIRST_STEP_LIMIT if variances is None else STEP_LIMIT
+        limit = FIRST_GAIN_LIMIT if variances is None else GAIN_LIMIT
         fit = levenberg_marquardt(
-            band.residuals, free, max_iterations=MAX_ITERATIONS, step_limit=limit
+            band.residuals, free, max_iterations=MAX_ITERATIONS, gain_limit=limit
         )
         if not np.isfinite(fit.cost):
             return NOT_MEASURED
@@ -345,10 +345,9 @@ def _result(fit: LeastSquaresFit, band: _Band, origin: FloatArray, *, settled: b
         factor * float(squares.mean()) if squares.size else 1.0,
         floor,
     )
-    rough = _outline_roughness(fit, band)
     return DiscFit(
         xy_px=origin + fit.x[:2],
-        cov_px2=fit.covariance(reduced if rough is None else max(rough, floor))[:2, :2],
+        cov_px2=_centre_covariance(fit, band, reduced, floor),
         ellipse=axes_of_shape(*fit.x[2:5]),
         blur_px=_blur_px(fit.x),
         contrast=float(fit.x[CONTRAST]),
@@ -356,6 +355,23 @@ def _result(fit: LeastSquaresFit, band: _Band, origin: FloatArray, *, settled: b
         reduced_residual=float(np.sqrt(factor * squares[edge].mean())) if edge.any() else 1.0,
         converged=fit.converged and settled,
     )
+
+
+def _centre_covariance(
+    fit: LeastSquaresFit, band: _Band, reduced: float, floor: float
+) -> FloatArray:
+    """Covariance of the centre: what a rough outline moves, and what the levels leave open.
+
+    With all other parameters known the edge alone moves the centre, and does so by the outline's
+    roughness; what light and shape add to that comes from flat pixels, with their noise.
+    """
+    whole = fit.covariance()[:2, :2]
+    rough = _outline_roughness(fit, band)
+    if rough is None:
+        return reduced * whole
+    by_centre = fit.jacobian[:, :2]
+    edge = np.linalg.inv(by_centre.T @ by_centre)
+    return np.asarray(max(rough, floor) * edge + max(1.0, floor) * (whole - edge))
 
 
 def _outline_roughness(fit: LeastSquaresFit, band: _Band) -> float | None:
@@ -376,6 +392,7 @@ def _outline_roughness(fit: LeastSquaresFit, band: _Band) -> float | None:
     around = np.arctan2((cos * y - sin * x) / b, (cos * x + sin * y) / a)
     distance = distance_terms(fit.x[:5], band.xy)[0]
     edge = _density(distance / _blur_px(fit.x)) / band.std
+    edge = edge * band.counted(fit)[0]  # clipped pixels know nothing
     order = np.arange(3, highest + 1)[:, None]
     waves = edge * np.concatenate([np.cos(order * around), np.sin(order * around)])
     power = (waves @ fit.residuals[:-1]) ** 2 / np.sum(waves**2, axis=1)

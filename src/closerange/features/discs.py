@@ -187,13 +187,13 @@ def saturation_level(frame: Frame) -> float:
 def _least_squares(
     frame: Frame, found: DiscCandidates, candidate: Candidate, full_scale: float, sign: float
 ) -> DiscFit:
-    """Fit the grey values; where that runs away, fall back on the blob's centroid."""
+    """Fit the grey values; where that ends nowhere, fall back on the blob's centroid."""
     start = candidate.outline
     fit = fit_disc(frame.pixels, start, full_scale=full_scale, foreground=found.foreground)
     limit = max(LOST_PX, LOST_SHARE * start.axes[1])
     stayed = np.hypot(*(fit.xy_px - start.centre)) <= limit
     known = np.isfinite(fit.cov_px2).all() and fit.ellipse[0] <= start.axes[0] + 2 * limit
-    if stayed and known:
+    if stayed and known and fit.converged:
         return fit
     # rounding moves a border more than an area: its covariance is on the safe side
     rough = _border_centroid(found, candidate, sign)

@@ -70,7 +70,14 @@ def write_text(path: Path | str, text: str) -> None:
     FileError
         As `write_bytes`.
     """
-    write_bytes(path, text.encode("utf-8"))
+    try:
+        content = text.encode("utf-8")
+    except UnicodeEncodeError as error:  # half a character, as from a file name in another encoding
+        raise FileError(
+            f"{path}: cannot be written as UTF-8: {text[error.start]!r} is no character",
+            remedy="rename the file or point that it comes from",
+        ) from error
+    write_bytes(path, content)
 
 
 def _refuse_folder(path: Path) -> None:

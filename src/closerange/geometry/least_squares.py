@@ -16,9 +16,10 @@ Residuals: TypeAlias = Callable[[FloatArray], tuple[FloatArray, FloatArray]]
 
 # Damping beyond which a step no longer changes float64 parameters: there is no way down.
 LARGEST_DAMPING = 1e12
-# A step whose predicted gain is below this share of the cost moves x by less than 1e-7 of its
-# standard deviation times sqrt(n); more digits would only be rounding.
-GAIN_LIMIT = 1e-14
+# Predicted gains, as shares of the cost: x moves by sqrt(share x n) of its standard deviations.
+# The first ends the search; where residuals are large and parameters hang together, each step
+# gains only a little less than the one before, and the second is good enough when steps run out.
+GAIN_LIMIT, GAIN_ENOUGH = 1e-12, 1e-7
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -78,6 +79,7 @@ def levenberg_marquardt(
     max_iterations: int = 100,
     step_limit: float = 1e-10,
     damping: float = 1e-3,
+    gain_limit: float = GAIN_LIMIT,
 ) -> LeastSquaresFit:
     """Minimise a sum of squares.
 
@@ -95,6 +97,8 @@ def levenberg_marquardt(
         by the length of its Jacobian column.
     damping : float, optional
         First damping, relative to the diagonal of J'J.
+    gain_limit : float, optional
+        It has also converged when the best step would lower the cost by less than this share.
 
     Returns
     -------
@@ -109,7 +113,7 @@ def levenberg_marquardt(
     x = np.array(start, dtype=np.float64)
     residuals, jacobian = function(x)
     cost = _cost(residuals)
-    iterations, converged = 0, cost == 0
+    iterations, converged, gain = 0, cost == 0, np.inf
     while np.isfinite(cost) and not converged and iterations < max_iterations:
         scale = _column_scale(jacobian)
         scaled = jacobian / scale
@@ -118,7 +122,7 @@ def levenberg_marquardt(
         gain = float(step @ (damping * step - gradient))
         small = np.linalg.norm(step) <= step_limit * (np.linalg.norm(x * scale) + step_limit)
         # Strong damping makes any step small; only a lightly damped one proves a minimum.
-        if damping <= 1 and gain <= GAIN_LIMIT * cost:
+        if damping <= 1 and gain <= gain_limit * cost:
             converged = True
             break
         iterations += 1
@@ -133,6 +137,7 @@ def levenberg_marquardt(
         converged = bool(small and damping <= 1) or cost == 0
         if damping > LARGEST_DAMPING:
             break
+    converged = converged or bool(iterations >= max_iterations and gain <= GAIN_ENOUGH * cost)
     return LeastSquaresFit(x, residuals, jacobian, cost, iterations, bool(converged))
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 import math
 import re
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -166,6 +166,28 @@ def check_duplicates(frames: Iterable[Frame]) -> None:
         If one camera's image occurs twice, or one image stands for two cameras. Both files
         are named.
     """
+    for _ in distinct(frames):
+        pass
+
+
+def distinct(frames: Iterable[Frame]) -> Iterator[Frame]:
+    """Pass frames on, one by one, as long as no pixels come twice.
+
+    Parameters
+    ----------
+    frames : iterable of Frame
+        As in `check_duplicates`.
+
+    Yields
+    ------
+    Frame
+        The same frames in the same order.
+
+    Raises
+    ------
+    InputError
+        As `check_duplicates`, when the second of two equal frames is reached.
+    """
     seen: dict[bytes, tuple[str, str]] = {}
     for frame in frames:
         digest = hashlib.sha256(f"{frame.pixels.dtype.str}{frame.pixels.shape}".encode())
@@ -175,6 +197,7 @@ def check_duplicates(frames: Iterable[Frame]) -> None:
             camera, source = seen[key]
             raise _duplicate(frame, camera, source)
         seen[key] = (frame.camera, frame.source)
+        yield frame
 
 
 def check_sizes(frames: Iterable[Frame]) -> None:

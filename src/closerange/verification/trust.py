@@ -12,8 +12,8 @@ CALIBRATION_SHARE = 3.0
 """Untrustworthy when the calibration contributes more than three times what one reading does:
 averaging readings then gains nothing, and the stated noise says nothing about the error."""
 
-VOLUME_SHARE = 0.02
-"""Untrustworthy when one reading errs by more than 2 % of the volume's diagonal: the points
+VOLUME_SHARE = 0.01
+"""Untrustworthy when one reading errs by more than 1 % of the volume's diagonal: the points
 then hardly belong together."""
 
 FAIR_SHARE = 1.0
@@ -41,26 +41,25 @@ def judge_rig(rig: Rig, *, volume_given: bool = False) -> Trust:
     Trust
         Verdict, predicted errors and reasons with remedies.
     """
+    if not np.isfinite(rig.parameter_cov).all():
+        reason = "the predicted error is not finite: add control points off their common plane"
+        return Trust("untrustworthy", np.full(3, np.nan), np.full(3, np.nan), (reason,))
     volume = rig.volume_mm if volume_given else judged_volume(rig.volume_mm)
     errors = predict_errors(rig, volume)
     total, calibration = _rms(errors.std_mm), _rms(errors.calibration_std_mm)
     grave = [
         *_convergence(rig),
         *_coverage(rig, errors),
-        *_grave(errors, total, calibration, volume),
+        *_grave(total, calibration, volume),
     ]
     light = _light(rig, errors, total, calibration)
     verdict = "untrustworthy" if grave else "fair" if light else "good"
     return Trust(verdict, total, calibration, tuple(grave + light))
 
 
-def _grave(
-    errors: ErrorMap, total: FloatArray, calibration: FloatArray, volume: FloatArray
-) -> list[str]:
+def _grave(total: FloatArray, calibration: FloatArray, volume: FloatArray) -> list[str]:
     if not np.isfinite(total).all():
-        if not np.isfinite(errors.std_mm).any():
-            return []  # one camera only, or none sees the volume: see `_coverage`
-        return ["the predicted error is not finite: add control points off their common plane"]
+        return []  # one camera only, or none sees the volume: see `_coverage`
     reasons = []
     image = np.sqrt(np.maximum(total**2 - calibration**2, 0.0))
     worst = int(np.argmax(calibration / np.maximum(image, 1e-300)))

@@ -2,20 +2,22 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
 
-from closerange.errors import CloseRangeError, DetectionError, InputError
+from closerange.errors import CloseRangeError, CloseRangeWarning, DetectionError, InputError
 from closerange.features.detect import detect_target
 from closerange.features.image_points import ImagePoints
-from closerange.features.target import Target
+from closerange.features.target import Chessboard, Target
 from closerange.features.target_file import read_target
 from closerange.files import read_csv
 from closerange.images import (
     Frame,
     check_frame,
+    distinct,
     list_images,
     placement_and_reading,
     read_image,
@@ -70,9 +72,14 @@ def detect(
     Raises
     ------
     InputError
-        If an image, the target or the pattern cannot be used.
+        If an image, the target or the pattern cannot be used, or one exposure occurs twice.
     DetectionError
         If a target is not, or not unambiguously, in an image; the message names the image.
+
+    Warns
+    -----
+    CloseRangeWarning
+        Of a board that looks the same after half a turn, and of what the images suffer from.
     """
     if not isinstance(target, Target):
         target = read_target(target)
@@ -84,8 +91,12 @@ def detect(
         )
     offsets = _offsets(crops)
     found: ImagePoints | None = None
-    for done, source in enumerate(sources, start=1):
-        frame = source if isinstance(source, Frame) else read_image(source, camera=camera)
+    _warn_if_symmetric(target)
+    frames = (
+        source if isinstance(source, Frame) else read_image(source, camera=camera)
+        for source in sources
+    )
+    for done, frame in enumerate(distinct(frames), start=1):
         name, reading = _names(frame, placement, placement_pattern)
         points = _detect_one(frame, target, name, reading, estimator)
         if offsets is not None:
@@ -129,6 +140,18 @@ def _sources(images: Images) -> list[Path | Frame]:
     for image in listed:
         sources.extend([image] if isinstance(image, Frame) else list_images(Path(image)))
     return sources
+
+
+def _warn_if_symmetric(target: Target) -> None:
+    board = target.pattern
+    if isinstance(board, Chessboard) and board.half_turn_symmetric:
+        warnings.warn(
+            f"a board of {board.rows} x {board.columns} inner corners looks the same after half a "
+            "turn: it is taken to be upright in every image, an upside-down one goes unnoticed; a "
+            "board with one odd and one even number has no such doubt",
+            CloseRangeWarning,
+            stacklevel=3,
+        )
 
 
 def _names(frame: Frame, placement: str | None, pattern: str | None) -> tuple[str, str]:

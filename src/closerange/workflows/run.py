@@ -280,7 +280,7 @@ def _write_all(
         write_positions(job.positions, folder / f"{stem}-positions.csv")
         if job.result is not None:
             write_result(job.result, folder / f"{stem}-result.json")
-            documents.append(job.result.to_document())
+            documents.append({"job": job.name, **job.result.to_document()})
     document = {
         "schema": RUN_SCHEMA,
         "title": settings.title,

@@ -177,7 +177,10 @@ def demo_text(result: RunResult) -> str:
     if lengths:
         errors = np.concatenate([check.error_mm[check.used] for check in lengths])
         rows.append(
-            ("Lengths", f"{len(errors)} bars of 80 mm: worst error {micrometres(_worst(errors))}")
+            (
+                "Lengths",
+                f"{len(errors)} bars of known length: worst error {micrometres(_worst(errors))}",
+            )
         )
     rows += [
         ("Report", result.report),
