@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 from scipy.integrate import quad
 from scipy.stats import norm
 
+from closerange.files import CsvTable
 from thesis.positions import averages, read_run
 from thesis.tables import AXES, Lines, fixed, markdown, read_json, read_table
 
@@ -18,11 +21,52 @@ def half_range_factor(count: int) -> float:
     return float(value) / 2
 
 
+ENVELOPE_HEADER = (
+    "axis",
+    "error envelope, mm",
+    "half range, mm",
+    'printed "repeatability envelope", mm',
+    "accuracy claimed, mm",
+    "standard deviation that fits, mm",
+    "same from the fitted rows of the 27-point run, mm",
+)
+
+
 def envelope_section() -> Lines:
     """Chapter 3: half ranges and the standard deviations that would give them."""
     source = read_json("fig_3_5_3_8_3_11_envelopes.json")
     positions = source["protocol"]["positions"]
     factor = half_range_factor(positions)
+    share = 100 * source["axes"]["Z"]["accuracy_claimed_mm"] / source["protocol"]["range_mm"][2]
+    return [
+        "### Chapter 3: 90 positions with 10 readings each",
+        "",
+        (
+            "**What survives:** the lowest and highest mean error of each axis. **What does not:** "
+            "the standard deviations (Figures 3.3, 3.6, 3.9), the means (3.4, 3.7, 3.10) and the "
+            "100 readings of Figure 3.2 exist only as plots, and no cycle time is given although "
+            "it is named as a figure of merit. The repeatability of 0.01 mm is a sentence without "
+            "a table."
+        ),
+        *markdown(ENVELOPE_HEADER, _envelope_rows(source, factor)),
+        (
+            'The printed "repeatability envelope" is half the range of the *mean errors*: a figure '
+            "of accuracy, not of repeatability. Of "
+            f"{positions} normal values half the range is {fixed(factor, 2)} standard deviations "
+            "on average, which gives the last column but one. The reference itself, dial gauges of "
+            "0.0127 mm, proves nothing below about 0.05 mm (four times its own error)."
+        ),
+        "",
+        (
+            'The conclusion states "2.2%" of the field; 0.29 mm of 12.7 mm is '
+            f"{fixed(share, 2)} %. The summary states an accuracy of 0.1 mm where chapter 3 has "
+            "0.13, 0.18 and 0.29 mm."
+        ),
+        "",
+    ]
+
+
+def _envelope_rows(source: Any, factor: float) -> list[list[str]]:
     residual = averages(read_run(27), ~read_run(27).check)
     rows = []
     for i, axis in enumerate(AXES):
@@ -41,42 +85,7 @@ def envelope_section() -> Lines:
                 fixed(residual[i] / np.sqrt(2 / np.pi), 3),
             ]
         )
-    header = [
-        "axis",
-        "error envelope, mm",
-        "half range, mm",
-        'printed "repeatability envelope", mm',
-        "accuracy claimed, mm",
-        "standard deviation that fits, mm",
-        "same from the fitted rows of the 27-point run, mm",
-    ]
-    share = 100 * source["axes"]["Z"]["accuracy_claimed_mm"] / source["protocol"]["range_mm"][2]
-    return [
-        "### Chapter 3: 90 positions with 10 readings each",
-        "",
-        (
-            "**What survives:** the lowest and highest mean error of each axis. **What does not:** "
-            "the standard deviations (Figures 3.3, 3.6, 3.9), the means (3.4, 3.7, 3.10) and the "
-            "100 readings of Figure 3.2 exist only as plots, and no cycle time is given although "
-            "it is named as a figure of merit. The repeatability of 0.01 mm is a sentence without "
-            "a table."
-        ),
-        *markdown(header, rows),
-        (
-            'The printed "repeatability envelope" is half the range of the *mean errors*: a figure '
-            "of accuracy, not of repeatability. Of "
-            f"{positions} normal values half the range is {fixed(factor, 2)} standard deviations "
-            "on average, which gives the last column but one. The reference itself, dial gauges of "
-            "0.0127 mm, proves nothing below about 0.05 mm (four times its own error)."
-        ),
-        "",
-        (
-            'The conclusion states "2.2%" of the field; 0.29 mm of 12.7 mm is '
-            f"{fixed(share, 2)} %. The summary states an accuracy of 0.1 mm where chapter 3 has "
-            "0.13, 0.18 and 0.29 mm."
-        ),
-        "",
-    ]
+    return rows
 
 
 def heights_section() -> Lines:
@@ -86,6 +95,35 @@ def heights_section() -> Lines:
         ("points", "actual_height_mm", "measured_first_mm", "measured_second_mm"),
         ("error_first_mm", "error_second_mm", "note"),
     )
+    actual = edges.floats("actual_height_mm")
+    first = edges.floats("measured_first_mm")
+    second = edges.floats("measured_second_mm", blank=np.nan)
+    errors = np.array([*(np.array(first) - actual), *(np.array(second) - actual)])
+    errors = errors[np.isfinite(errors)]
+    return [
+        "### Chapter 5: heights from corresponding points (Tables 5.1 and 5.2)",
+        *markdown(
+            [
+                "edge points",
+                "vernier, mm",
+                "Table 5.2, mm",
+                "Table 5.1 plus 50, mm",
+                "error of Table 5.2, mm",
+            ],
+            _height_rows(edges),
+        ),
+        _summary("nine edge points", errors),
+        "",
+        (
+            f"{(np.abs(errors) > STATED_LIMIT_MM).sum()} of the nine errors exceeds the stated "
+            f'"less than {STATED_LIMIT_MM} mm". Table 5.1 and Table 5.2 disagree for point 1 '
+            "(1.5 against 51.55 - 50) and in the last digit for point 8."
+        ),
+        "",
+    ]
+
+
+def _height_rows(edges: CsvTable) -> list[list[str]]:
     depth = read_table("table_5_1.csv", ("point", "z_mm"), ("note",)).floats("z_mm")
     actual = edges.floats("actual_height_mm")
     first = edges.floats("measured_first_mm")
@@ -103,29 +141,18 @@ def heights_section() -> Lines:
                 ", ".join(fixed(v - actual[i], 2) for v in printed),
             ]
         )
-    errors = np.array([*(np.array(first) - actual), *(np.array(second) - actual)])
-    errors = errors[np.isfinite(errors)]
-    return [
-        "### Chapter 5: heights from corresponding points (Tables 5.1 and 5.2)",
-        *markdown(
-            [
-                "edge points",
-                "vernier, mm",
-                "Table 5.2, mm",
-                "Table 5.1 plus 50, mm",
-                "error of Table 5.2, mm",
-            ],
-            rows,
-        ),
-        _summary("nine edge points", errors),
-        "",
-        (
-            f"{(np.abs(errors) > STATED_LIMIT_MM).sum()} of the nine errors exceeds the stated "
-            f'"less than {STATED_LIMIT_MM} mm". Table 5.1 and Table 5.2 disagree for point 1 '
-            "(1.5 against 51.55 - 50) and in the last digit for point 8."
-        ),
-        "",
-    ]
+    return rows
+
+
+CENTROID_HEADER = (
+    "label",
+    "x'' morphological minus border, px",
+    "y'' likewise, px",
+    "height printed, mm",
+    "Z plus 50, mm",
+    "vernier, mm",
+    "error, mm",
+)
 
 
 def centroid_section() -> Lines:
@@ -159,18 +186,9 @@ def centroid_section() -> Lines:
         ]
         for i, label in enumerate(height.texts("label"))
     ]
-    header = [
-        "label",
-        "x'' morphological minus border, px",
-        "y'' likewise, px",
-        "height printed, mm",
-        "Z plus 50, mm",
-        "vernier, mm",
-        "error, mm",
-    ]
     return [
         "### Chapter 5: centroids (Tables 5.3 and 5.4)",
-        *markdown(header, rows),
+        *markdown(CENTROID_HEADER, rows),
         _summary("five centroids", z + 50 - reference),
         "",
         (

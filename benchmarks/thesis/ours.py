@@ -132,6 +132,15 @@ def _error_row(label: str, mean_abs_mm: FloatArray, diagonal: float) -> list[str
     return [label, *(fixed(value, 4) for value in mean_abs_mm), fixed(ppm, 0)]
 
 
+TEST_HEADER = (
+    "test",
+    *(f"error {a}, mm" for a in AXES),
+    *(f"half range {a}, mm" for a in AXES),
+    *(f"repeatability {a}, mm" for a in AXES),
+    "readings inside their 95 % region, %",
+)
+
+
 def single_point_section(rig: Rig, points: ImagePoints, truth: ControlPoints) -> Lines:
     """Chapter 3 again: 90 positions, rendered with 3 readings and synthetic with 10."""
     rendered = _test(rig, points, truth)
@@ -147,13 +156,6 @@ def single_point_section(rig: Rig, points: ImagePoints, truth: ControlPoints) ->
         _report_row("rendered, 90 x 3", rendered),
         _report_row("synthetic rig A, 90 x 10", synthetic),
     ]
-    header = [
-        "test",
-        *(f"error {a}, mm" for a in AXES),
-        *(f"half range {a}, mm" for a in AXES),
-        *(f"repeatability {a}, mm" for a in AXES),
-        "readings inside their 95 % region, %",
-    ]
     share = 1e6 * rendered.report.accuracy.rms_mm[3] / (SINGLE_CUBE_MM * np.sqrt(3))
     return [
         "### The single-point test",
@@ -165,7 +167,7 @@ def single_point_section(rig: Rig, points: ImagePoints, truth: ControlPoints) ->
             f"150 mm, noise of 0.05 px on each coordinate, seed {SEED}. Errors are actual minus "
             "mean; repeatability is the pooled standard deviation of the readings."
         ),
-        *markdown(header, rows),
+        *markdown(TEST_HEADER, rows),
         (
             f"RMS error in space: rendered {_in_space(rendered)} mm ({fixed(share, 0)} ppm of the "
             f"cube's diagonal), synthetic {_in_space(synthetic)} mm. The thesis gives no "

@@ -78,6 +78,16 @@ def readings() -> dict[str, FloatArray]:
     return found
 
 
+CAMERA_HEADER = (
+    "reading",
+    "centre X, Y, Z in mm",
+    "fx, px",
+    "fy, px",
+    "skew, deg",
+    "principal point from image centre, px",
+)
+
+
 def parameters_section() -> Lines:
     """Decomposition of both readings and how far they lie apart in the image."""
     found = readings()
@@ -101,14 +111,7 @@ def parameters_section() -> Lines:
             "camera two readings are possible, and both are shown."
         ),
         *markdown(
-            [
-                "reading",
-                "centre X, Y, Z in mm",
-                "fx, px",
-                "fy, px",
-                "skew, deg",
-                "principal point from image centre, px",
-            ],
+            CAMERA_HEADER,
             rows,
         ),
         (

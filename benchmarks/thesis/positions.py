@@ -123,7 +123,7 @@ def averages_section(runs: list[Run]) -> Lines:
         rows += [
             [f"{label}: {kind}", *(fixed(v, 5) for v in values)] for kind, values in kinds.items()
         ]
-    text = [
+    return [
         "### Averages of Figures 2.5 to 2.10",
         "",
         (
@@ -144,8 +144,8 @@ def averages_section(runs: list[Run]) -> Lines:
             "From 18 to 54 calibration points nothing improves: what limits these runs is "
             "systematic, not noise."
         ),
+        "",
     ]
-    return [*text, ""]
 
 
 def _inside_table(runs: list[Run]) -> Lines:
@@ -176,13 +176,6 @@ def dots_section(runs: list[Run]) -> Lines:
         [axis, fixed(100 * share[i], 0), fixed(before[i], 3), fixed(after[i], 3)]
         for i, axis in enumerate(AXES)
     ]
-    signed = [
-        [
-            f"{run.points} points",
-            *(fixed(value, 3) for value in _centre_check(run)),
-        ]
-        for run in runs
-    ]
     return [
         "### What repeats for each dot",
         "",
@@ -205,7 +198,13 @@ def dots_section(runs: list[Run]) -> Lines:
             "centre dot's +0.10 mm in X, which speaks for the dot rather than the lens, if another "
             "mark was used there; the source does not say. Their mean signed errors in mm:"
         ),
-        *markdown(["check rows at X = Y = 0", "X", "Y", "Z"], signed),
+        *markdown(["check rows at X = Y = 0", "X", "Y", "Z"], _signed_rows(runs)),
+    ]
+
+
+def _signed_rows(runs: list[Run]) -> list[list[str]]:
+    return [
+        [f"{run.points} points", *(fixed(value, 3) for value in _centre_check(run))] for run in runs
     ]
 
 

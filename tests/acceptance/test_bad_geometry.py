@@ -196,18 +196,25 @@ def behind(row):
         row["z_mm"] = "3000"
 
 
-def test_item_40_control_point_behind_the_cameras(tables, refused):
+@pytest.fixture
+def with_one_behind(tables):
+    """Give three placements, one of whose control points lies behind the cameras."""
     tables.edit("control.csv", behind)
-    refused(tables.calibrate, 1, once=True)
+    for name in ("left.csv", "right.csv"):
+        tables.keep(name, lambda row: row["placement"] in {"z0", "z4", "z6"})
+    return tables
+
+
+def test_item_40_control_point_behind_the_cameras(with_one_behind, refused):
+    refused([*with_one_behind.calibrate, "--model", "brown"], 1, once=True)
 
 
 @pytest.mark.xfail(
     strict=True,
     reason="one control row far outside pulls the start of the fit: labels are suspected instead",
 )
-def test_item_40_control_point_behind_the_cameras_is_named(tables, refused):
-    tables.edit("control.csv", behind)
-    refused(tables.calibrate, 1, "z4/r1c1", once=True)
+def test_item_40_control_point_behind_the_cameras_is_named(with_one_behind, refused):
+    refused([*with_one_behind.calibrate, "--model", "brown"], 1, "z4/r1c1", once=True)
 
 
 def test_item_40_rays_that_meet_behind_the_cameras(tables, run, tmp_path):

@@ -7,6 +7,7 @@ the package: a plate of nine discs, 640 x 512 px, 8 bits.
 from __future__ import annotations
 
 import csv
+import json
 import shutil
 import struct
 import zlib
@@ -481,6 +482,22 @@ def test_item_25_disc_that_is_missing_is_not_invented(run, looking, good, truth,
     assert "not_found" in flags(rows)[4]
     others = [i for i in range(9) if i != 4]
     np.testing.assert_allclose(xy(rows)[others], truth[others], atol=0.01)
+
+
+def test_warnings_stand_in_the_json_summary(run, looking, good, tmp_path):
+    image = save(tmp_path / "colour.png", cv2.cvtColor(good, cv2.COLOR_GRAY2BGR))
+    outcome = run(*looking(image), "--json", "-o", tmp_path / "points.csv")
+    (warning,) = json.loads(outcome.stdout)["warnings"]
+    assert f"warning: {warning}" in outcome.stderr
+    assert "colours turned to grey" in warning
+
+
+def test_errors_stand_in_the_json_summary(run, looking, tmp_path):
+    outcome = run(*looking(tmp_path / "none.png"), "--json", "-o", tmp_path / "points.csv")
+    document = json.loads(outcome.stdout)
+    assert document["exit_code"] == outcome.code == 2
+    assert "none.png" in document["error"]
+    assert document["remedy"]
 
 
 @pytest.mark.parametrize("pattern", ["(", "z.*", "_(q)$", "(?P<reading>z.*)"])

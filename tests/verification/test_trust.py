@@ -65,7 +65,7 @@ def test_a_four_hundred_fold_noise_is_not_trusted():
         rig = calibrated(rig_b(), noise_px=20.0, model="pinhole")
     trust = judge_rig(rig)
     assert trust.verdict == "untrustworthy"
-    assert any("limit 2 %" in reason and "named rightly" in reason for reason in trust.reasons)
+    assert any("limit 1 %" in reason and "named rightly" in reason for reason in trust.reasons)
 
 
 def test_few_degrees_of_freedom_are_fair_at_best():

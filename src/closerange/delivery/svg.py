@@ -163,7 +163,7 @@ def _element(tag: str, content: Markup, attributes: dict[str, str | float]) -> M
 
 @dataclass(frozen=True, slots=True)
 class Scale:
-    """A linear map from values to drawing units."""
+    """A linear map from values to drawing units; a range without extent goes to its middle."""
 
     low: float
     high: float
@@ -172,7 +172,9 @@ class Scale:
 
     def __call__(self, value: float) -> float:
         """Return the drawing coordinate of a value."""
-        return self.start + (value - self.low) / (self.high - self.low) * (self.end - self.start)
+        span = self.high - self.low
+        share = (value - self.low) / span if span else 0.5
+        return self.start + share * (self.end - self.start)
 
 
 def nice_step(span: float, count: int) -> float:

@@ -10,6 +10,19 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import ndtr
 
+from closerange.features.disc_model import (
+    BACKGROUND,
+    BLUR,
+    CONTRAST,
+    CONTRAST_SLOPES,
+    LENS_LOG_STD,
+    USUAL_LENS_PX,
+    blur_px,
+    density,
+    grey_values,
+    has_flat_middle,
+    start_vector,
+)
 from closerange.geometry.arrays import BoolArray, FloatArray
 from closerange.geometry.ellipse import Ellipse, axes_of_shape, distance_terms
 from closerange.geometry.least_squares import LeastSquaresFit, levenberg_marquardt
@@ -21,14 +34,6 @@ BAND_BLURS, BAND_FLAT_PX = 3.0, 1.5
 NEIGHBOUR_BLURS = 2.0
 # Foreground this near to a disc's outline is its own edge.
 OWN_EDGE_PX = 2.0
-# A pixel is a square, not a point: of all edges it takes this variance.
-PIXEL_BLUR_PX2 = 1 / 12
-# Blur of a lens in focus, and how far it may be off: a factor 2 is one sigma. A thousand pixels
-# overrule it; on a disc of a dozen pixels, where blur, size and contrast are exchangeable, it
-# decides.
-USUAL_LENS_PX, LENS_LOG_STD = 0.75, float(np.log(2.0))
-# Below this radius (blurs) the interior has no flat middle that could show a slope of its own.
-SLOPE_RADIUS_BLURS = 6.0
 # Rounding to whole grey values: uniform over one of them.
 QUANTISATION_DN2 = 1 / 12
 # Share of the edge profile below which a pixel is flat, and how many flat pixels give a variance
@@ -38,8 +43,6 @@ IMAGINED_PIXELS = 2
 # Undulations of the outline shorter than this are damped by the blur and the pixels; with fewer
 # degrees of freedom than this their variance is known to no better than a half.
 ROUGHNESS_WAVE_PX, ROUGHNESS_DOF = 6.0, 8
-# A blur beyond 0.02 .. 50 px is not what this model describes.
-LARGEST_LOG_BLUR = 4.0
 # What a last step could still gain, as a share of the cost: of a hundred pixels' residuals, 1e-6
 # is a hundredth of a standard deviation. The first pass only places the band and the weights.
 FIRST_GAIN_LIMIT, GAIN_LIMIT = 1e-4, 1e-6
@@ -118,7 +121,7 @@ def fit_disc(
     the previous pass left inside and outside (shot noise differs); quantisation is their floor.
     """
     crop = _Crop.around(pixels, start, foreground)
-    x = _start_vector(start)
+    x = start_vector(start)
     variances: tuple[float, float] | None = None
     result = NOT_MEASURED
     for _ in range(MAX_PASSES):
@@ -127,7 +130,7 @@ def fit_disc(
             return NOT_MEASURED
         if variances is None:
             x[BACKGROUND], x[CONTRAST] = band.levels()
-        free = x if _has_flat_middle(x) else x[:CONTRAST_SLOPES]
+        free = x if has_flat_middle(x) else x[:CONTRAST_SLOPES]
         limit = FIRST_GAIN_LIMIT if variances is None else GAIN_LIMIT
         fit = levenberg_marquardt(
             band.residuals, free, max_iterations=MAX_ITERATIONS, gain_limit=limit
@@ -142,11 +145,6 @@ def fit_disc(
         x = np.append(fit.x, np.zeros(x.size - fit.x.size))
         variances = band.variances_after(fit)
     return result
-
-
-# Parameters: centre x, y and shape xx, xy, yy as in `distance_terms`; logarithm of the lens' blur;
-# background with two slopes; contrast with two slopes. Positions count from the start's centre.
-BLUR, BACKGROUND, CONTRAST, CONTRAST_SLOPES = 5, 6, 9, 10
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -183,7 +181,7 @@ class _Crop:
     ) -> _Band | None:
         """Choose the pixels along the edge; None if they cannot carry the parameters."""
         distance = distance_terms(x[:5], self.xy)[0]
-        blur = _blur_px(x)
+        blur = blur_px(x)
         at_edge = np.abs(distance) < 1
         gap = float(self.to_other[at_edge].min()) if at_edge.any() else 0.0
         chosen = np.abs(distance) <= BAND_BLURS * blur + BAND_FLAT_PX
@@ -217,12 +215,12 @@ class _Band:
 
     def residuals(self, x: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Weighted residuals and Jacobian; the last row is the lens' usual blur."""
-        model, jacobian = _grey_values(x, self.xy)
+        model, jacobian = grey_values(x, self.xy)
         if np.isfinite(self.full_scale):
             # E[min(value + noise, full scale)] and its slope
             excess = (model - self.full_scale) / self.std
             unclipped = ndtr(-excess)
-            model = model - self.std * (excess * (1 - unclipped) + _density(excess))
+            model = model - self.std * (excess * (1 - unclipped) + density(excess))
             jacobian = jacobian * unclipped[:, None]
         rows = np.zeros((x.size, len(model) + 1))
         rows[:, :-1] = jacobian.T / self.std
@@ -234,7 +232,7 @@ class _Band:
         """Return which pixels tell about noise, and the factor for the fitted parameters."""
         kept = np.ones(len(self.values), dtype=bool)
         if np.isfinite(self.full_scale):
-            kept = _grey_values(fit.x, self.xy)[0] < self.full_scale - 2 * self.std
+            kept = grey_values(fit.x, self.xy)[0] < self.full_scale - 2 * self.std
         number = int(np.count_nonzero(kept))
         return kept, number / max(number + 1 - fit.x.size, 1)
 
@@ -268,36 +266,6 @@ class _Band:
         return np.asarray(np.maximum(variances, 0.1 * mean))
 
 
-def _grey_values(x: FloatArray, xy: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Model grey values (n,) and their Jacobian (n, p); NaN outside the model's domain."""
-    if not abs(x[BLUR]) < LARGEST_LOG_BLUR:
-        return np.full(len(xy), np.nan), np.full((len(xy), x.size), np.nan)
-    distance, by_centre, by_shape, _ = distance_terms(x[:5], xy)
-    blur = _blur_px(x)
-    t = distance / blur
-    inside, density = ndtr(-t), _density(t)
-    slopes = xy.T
-    background = x[BACKGROUND] + x[BACKGROUND + 1 : CONTRAST] @ slopes
-    contrast = np.full(len(xy), x[CONTRAST])
-    if x.size > CONTRAST_SLOPES:
-        contrast += x[CONTRAST_SLOPES:] @ slopes
-    edge = contrast * density
-    by_distance = edge / -blur
-    rows = np.empty((x.size, len(xy)))  # one parameter a row is quicker to fill
-    rows[:2] = by_distance * by_centre.T
-    rows[2:BLUR] = by_distance * by_shape.T
-    rows[BLUR] = edge * t * (1 - PIXEL_BLUR_PX2 / blur**2)
-    rows[BACKGROUND] = 1
-    rows[BACKGROUND + 1 : CONTRAST] = slopes
-    rows[CONTRAST] = inside
-    rows[CONTRAST_SLOPES:] = inside * slopes[: x.size - CONTRAST_SLOPES]
-    return background + contrast * inside, rows.T
-
-
-def _density(t: FloatArray) -> FloatArray:
-    return np.asarray(np.exp(-0.5 * t * t) / np.sqrt(2 * np.pi))
-
-
 def _first_variances(values: FloatArray, inside: FloatArray) -> tuple[float, float]:
     """Robust variances of the flat sides: weights for the first pass only."""
     found = []
@@ -310,26 +278,11 @@ def _first_variances(values: FloatArray, inside: FloatArray) -> tuple[float, flo
     return (found[0], found[-1]) if found else (1.0, 1.0)
 
 
-def _start_vector(start: Ellipse) -> FloatArray:
-    (xx, xy), (_, yy) = start.shape
-    return np.array([0, 0, xx, xy, yy, np.log(USUAL_LENS_PX), 0, 0, 0, 0, 0, 0], dtype=np.float64)
-
-
 def _moved(before: FloatArray, after: FloatArray) -> bool:
     """Whether the band of `before` was misplaced by half a pixel, or its width by 15 %."""
     size = [np.array(axes_of_shape(*x[2:5])[:2]) for x in (before, after)]
     shifts = np.append(after[:2] - before[:2], size[1] - size[0])
-    return bool((np.abs(shifts) > 0.5).any() or abs(_blur_px(after) / _blur_px(before) - 1) > 0.15)
-
-
-def _blur_px(x: FloatArray) -> float:
-    """Blur of lens and pixel together."""
-    return float(np.sqrt(np.exp(2 * x[BLUR]) + PIXEL_BLUR_PX2))
-
-
-def _has_flat_middle(x: FloatArray) -> bool:
-    blur = max(_blur_px(x), USUAL_LENS_PX)
-    return axes_of_shape(*x[2:5])[1] > SLOPE_RADIUS_BLURS * blur
+    return bool((np.abs(shifts) > 0.5).any() or abs(blur_px(after) / blur_px(before) - 1) > 0.15)
 
 
 def _result(fit: LeastSquaresFit, band: _Band, origin: FloatArray, *, settled: bool) -> DiscFit:
@@ -349,7 +302,7 @@ def _result(fit: LeastSquaresFit, band: _Band, origin: FloatArray, *, settled: b
         xy_px=origin + fit.x[:2],
         cov_px2=_centre_covariance(fit, band, reduced, floor),
         ellipse=axes_of_shape(*fit.x[2:5]),
-        blur_px=_blur_px(fit.x),
+        blur_px=blur_px(fit.x),
         contrast=float(fit.x[CONTRAST]),
         noise=float(np.sqrt(np.mean(variances))),
         reduced_residual=float(np.sqrt(factor * squares[edge].mean())) if edge.any() else 1.0,
@@ -370,7 +323,10 @@ def _centre_covariance(
     if rough is None:
         return reduced * whole
     by_centre = fit.jacobian[:, :2]
-    edge = np.linalg.inv(by_centre.T @ by_centre)
+    information = by_centre.T @ by_centre
+    if not (np.isfinite(whole).all() and np.linalg.det(information) > 0):
+        return np.full((2, 2), np.inf)  # no contrast: nothing holds the centre
+    edge = np.linalg.inv(information)
     return np.asarray(max(rough, floor) * edge + max(1.0, floor) * (whole - edge))
 
 
@@ -391,7 +347,7 @@ def _outline_roughness(fit: LeastSquaresFit, band: _Band) -> float | None:
     cos, sin = np.cos(angle), np.sin(angle)
     around = np.arctan2((cos * y - sin * x) / b, (cos * x + sin * y) / a)
     distance = distance_terms(fit.x[:5], band.xy)[0]
-    edge = _density(distance / _blur_px(fit.x)) / band.std
+    edge = density(distance / blur_px(fit.x)) / band.std
     edge = edge * band.counted(fit)[0]  # clipped pixels know nothing
     order = np.arange(3, highest + 1)[:, None]
     waves = edge * np.concatenate([np.cos(order * around), np.sin(order * around)])

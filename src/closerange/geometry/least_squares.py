@@ -111,8 +111,7 @@ def levenberg_marquardt(
     (doi:10.1137/0111030). Columns of zeros are allowed: their parameters stay where they are.
     """
     x = np.array(start, dtype=np.float64)
-    residuals, jacobian = function(x)
-    cost = _cost(residuals)
+    residuals, jacobian, cost = _evaluated(function, x)
     iterations, converged, gain = 0, cost == 0, np.inf
     while np.isfinite(cost) and not converged and iterations < max_iterations:
         scale = _column_scale(jacobian)
@@ -127,8 +126,7 @@ def levenberg_marquardt(
             break
         iterations += 1
         trial = x + step / scale
-        trial_residuals, trial_jacobian = function(trial)
-        trial_cost = _cost(trial_residuals)
+        trial_residuals, trial_jacobian, trial_cost = _evaluated(function, trial)
         if trial_cost <= cost and np.isfinite(trial_jacobian).all():
             x, residuals, jacobian, cost = trial, trial_residuals, trial_jacobian, trial_cost
             damping = max(damping / 10, 1e-12)
@@ -141,9 +139,12 @@ def levenberg_marquardt(
     return LeastSquaresFit(x, residuals, jacobian, cost, iterations, bool(converged))
 
 
-def _cost(residuals: FloatArray) -> float:
-    cost = float(residuals @ residuals)
-    return cost if np.isfinite(cost) else np.inf
+def _evaluated(function: Residuals, x: FloatArray) -> tuple[FloatArray, FloatArray, float]:
+    """Residuals, Jacobian and cost; a trial step may overflow without a warning: it is rejected."""
+    with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
+        residuals, jacobian = function(x)
+        cost = float(residuals @ residuals)
+    return residuals, jacobian, cost if np.isfinite(cost) else np.inf
 
 
 def _column_scale(jacobian: FloatArray) -> FloatArray:

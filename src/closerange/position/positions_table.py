@@ -15,6 +15,9 @@ from closerange.position.positions import Positions
 REQUIRED = ("placement", "point", "x_mm", "y_mm", "z_mm")
 COVARIANCE = ("cov_xx_mm2", "cov_xy_mm2", "cov_xz_mm2", "cov_yy_mm2", "cov_yz_mm2", "cov_zz_mm2")
 OPTIONAL = (*COVARIANCE, "residual_px", "cameras", "flags", "reading")
+
+MAX_CAMERAS = 1_000_000
+"""Largest count of cameras read: far beyond any rig, and a whole number in every type."""
 _UPPER = np.triu_indices(3)
 
 
@@ -137,9 +140,9 @@ def _covariances(table: CsvTable) -> FloatArray:
 def _counts(table: CsvTable) -> IntArray:
     counts = table.floats("cameras", blank=0.0)
     for row, count in enumerate(counts):
-        if count < 0 or count != int(count):
+        if not 0 <= count <= MAX_CAMERAS or count != int(count):
             raise TableError(
                 f"{table.where(row, 'cameras')}: {count} is not a number of cameras",
-                remedy="write a whole number",
+                remedy=f"write a whole number from 0 to {MAX_CAMERAS}",
             )
     return np.array(counts, dtype=np.int64)

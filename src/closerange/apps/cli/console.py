@@ -23,6 +23,8 @@ INTERRUPTED = 130
 QUIET_S = 1.0
 """Work shorter than this shows no progress."""
 
+_shown: list[str] = []  # warnings of the command that runs, for its JSON summary
+
 
 def verb(command: Callable[P, int]) -> Callable[P, None]:
     """Turn a function that returns an exit code into a command.
@@ -41,6 +43,7 @@ def verb(command: Callable[P, int]) -> Callable[P, None]:
     @functools.wraps(command)
     def wrapped(*args: P.args, **kwargs: P.kwargs) -> None:
         as_json = bool(kwargs.get("json_output"))
+        _shown.clear()
         try:
             with warnings.catch_warnings():
                 warnings.simplefilter("always", CloseRangeWarning)
@@ -63,7 +66,11 @@ def say(text: str, *, json_output: bool) -> None:
 
 
 def print_json(summary: Mapping[str, Any]) -> None:
-    """Print a machine-readable summary on stdout; what is not finite becomes null."""
+    """Print a machine-readable summary, with the warnings, on stdout.
+
+    What is not finite becomes null.
+    """
+    summary = {"warnings": list(dict.fromkeys(_shown)), **summary}
     typer.echo(json.dumps(_finite(summary), ensure_ascii=False, indent=1))
 
 
@@ -112,6 +119,7 @@ class Progress:
 
 
 def _show_warning(message: Warning | str, *_: Any, **__: Any) -> None:
+    _shown.append(str(message))
     typer.echo(f"warning: {message}", err=True)
 
 
