@@ -151,6 +151,13 @@ class Settings(_Table):
     job: list[Job] = []
     outputs: Outputs = Outputs()
 
+    @model_validator(mode="after")
+    def _jobs_write_different_files(self) -> Settings:
+        names = [job.name.replace(" ", "-").casefold() for job in self.job]
+        if len(set(names)) < len(names):
+            raise ValueError("two jobs would write the same files; give each job its own name")
+        return self
+
 
 def read_settings(path: Path | str) -> Settings:
     """Read a project file.

@@ -319,6 +319,30 @@ def test_a_folder_that_is_no_result_is_never_replaced(project, run):
         assert without_parts(results) == ["thesis.txt"]
 
 
+@pytest.mark.parametrize("options", [[], ["--overwrite"]])
+def test_results_do_not_replace_the_project(project, run, options):
+    (project / "run.json").write_text("{}", encoding="utf-8")
+    before = without_parts(project)
+    for folder in (project, project.parent):
+        outcome = run("run", project / "closerange.toml", "--output", folder, *options)
+        assert outcome.code == 2
+        assert "the project lies in it" in outcome.stderr
+        assert without_parts(project) == before
+
+
+def test_results_below_a_file(project, run):
+    outcome = run("run", project / "closerange.toml", "--output", project / "plate.toml" / "here")
+    assert outcome.code == 2
+    assert "plate.toml: is a file" in outcome.stderr
+
+
+def test_refused_run_makes_no_folders_on_the_way(project, run):
+    (project / "control.csv").unlink()
+    output = project / "new" / "results"
+    assert run("run", project / "closerange.toml", "--output", output).code == 2
+    assert not (project / "new").exists()
+
+
 def full_disk(*_args, **_kwargs):
     raise OSError(errno.ENOSPC, "No space left on device")
 
@@ -396,6 +420,24 @@ def test_ctrl_c_stops_a_run_cleanly_and_keeps_older_results(project, run):
     assert "Traceback" not in stderr
     (project / "working").unlink()
     assert (without_parts(project), without_parts(project / "results")) == listed
+    assert (project / "results" / "run.json").read_bytes() == before
+
+
+def test_ctrl_c_while_older_results_are_replaced_keeps_them(project, run, monkeypatch):
+    """Between the two renames: the older results come back."""
+    assert run("run", project / "closerange.toml").code == 0
+    before = (project / "results" / "run.json").read_bytes()
+    listed = without_parts(project)
+    rename = Path.replace
+
+    def pressed(path, target):
+        if path.name == "new":
+            raise KeyboardInterrupt
+        return rename(path, target)
+
+    monkeypatch.setattr(Path, "replace", pressed)
+    assert run("run", project / "closerange.toml", "--overwrite").code == 130
+    assert without_parts(project) == listed
     assert (project / "results" / "run.json").read_bytes() == before
 
 

@@ -428,7 +428,7 @@ def test_item_61_moving_readings_are_not_called_frozen(tables, run, tmp_path):
         ("point", ""),
     ],
 )
-def test_item_33_bad_cell_in_the_positions(tables, run, refused, tmp_path, column, text):
+def test_item_33_bad_cell_in_the_positions(tables, run, refused, column, text):
     positions = tables.folder / "positions.csv"
     assert run(*tables.measure, "-o", positions).code == 0
     tables.edit("positions.csv", first_row(column, text))

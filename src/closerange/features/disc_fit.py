@@ -28,8 +28,9 @@ from closerange.geometry.ellipse import Ellipse, axes_of_shape, distance_terms
 from closerange.geometry.least_squares import LeastSquaresFit, levenberg_marquardt
 
 # Half-width of the fitted band: within 3 sigma of blur the edge is complete to 0.1 % of the
-# contrast; 1.5 px more of flat grey on either side fix the two levels.
-BAND_BLURS, BAND_FLAT_PX = 3.0, 1.5
+# contrast; 2.5 px more of flat grey on either side fix the two levels and their slopes (within
+# 10 % of the bound that all pixels would allow) and stay a small neighbourhood of the edge.
+BAND_BLURS, BAND_FLAT_PX = 3.0, 2.5
 # A pixel next to another feature is left out where that feature's own blur reaches it.
 NEIGHBOUR_BLURS = 2.0
 # Foreground this near to a disc's outline is its own edge.

@@ -18,6 +18,7 @@ OPTIONAL = (*COVARIANCE, "residual_px", "cameras", "flags", "reading")
 
 MAX_CAMERAS = 1_000_000
 """Largest count of cameras read: far beyond any rig, and a whole number in every type."""
+
 _UPPER = np.triu_indices(3)
 
 

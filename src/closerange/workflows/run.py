@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import shutil
 import tempfile
 import time
 import warnings
@@ -127,27 +126,52 @@ def run(
     """
     settings = read_settings(project)
     folder = Path(output) if output is not None else inside(settings, settings.outputs.folder)
-    _check_free(folder, overwrite=overwrite)
-    folder.parent.mkdir(parents=True, exist_ok=True)
+    _check_free(folder, Path(project), overwrite=overwrite)
+    _check_named_files(settings)
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always", CloseRangeWarning)
         result, overlays = _measure_all(settings, folder, announce)
     notes = tuple(dict.fromkeys(str(entry.message) for entry in caught))
     result = RunResult(folder, result.rig, result.jobs, notes, result.calibration_s)
-    # written aside and renamed: an interruption leaves no half-filled folder of results
-    with tempfile.TemporaryDirectory(prefix=f".{folder.name}.", dir=folder.parent) as aside:
-        staged = Path(aside) / folder.name
-        staged.mkdir()
-        _write_all(staged, settings, result, overlays, _hashes(settings, Path(project)))
-        if folder.exists():
-            shutil.rmtree(folder)
-        staged.replace(folder)
+    hashes = _hashes(settings, Path(project))
+    _put(folder, lambda staged: _write_all(staged, settings, result, overlays, hashes))
     return result
 
 
-def _check_free(folder: Path, *, overwrite: bool) -> None:
-    if folder.exists() and not folder.is_dir():
-        raise FileError(f"{folder}: is a file", remedy="name a folder")
+def _put(folder: Path, write: Callable[[Path], None]) -> None:
+    """Fill a folder aside and rename it: an interruption leaves the old one, or none."""
+    target = folder.resolve()
+    try:
+        target.parent.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryDirectory(prefix=f".{target.name}.", dir=target.parent) as aside:
+            staged, old = Path(aside) / "new", Path(aside) / "old"
+            staged.mkdir()
+            write(staged)
+            if target.exists():
+                target.replace(old)
+            try:
+                staged.replace(target)
+            except BaseException:
+                if old.exists():
+                    old.replace(target)
+                raise
+    except OSError as error:
+        raise FileError(
+            f"{folder}: cannot be written ({error.strerror or error})",
+            remedy="check that the place is writable and has room",
+        ) from error
+
+
+def _check_free(folder: Path, project: Path, *, overwrite: bool) -> None:
+    place = folder.resolve()
+    nearest = next(part for part in (place, *place.parents) if part.exists())
+    if not nearest.is_dir():
+        raise FileError(f"{nearest}: is a file", remedy="name a folder")
+    if project.resolve().is_relative_to(place):
+        raise FileError(
+            f"{folder}: the project lies in it, results replace their whole folder",
+            remedy="name a folder of their own",
+        )
     if folder.is_dir() and any(folder.iterdir()) and not overwrite:
         raise FileError(
             f"{folder}: the folder exists and is not empty",
@@ -247,18 +271,25 @@ def _overlays(
     return overlays
 
 
+def _named_files(settings: Settings) -> list[str]:
+    """List the tables and targets that the project names, as they are written there."""
+    keys = ("target", "crops", "control", "truth")
+    parts = (settings.calibration, *settings.job)
+    return [name for part in parts for key in keys if (name := getattr(part, key, None))]
+
+
+def _check_named_files(settings: Settings) -> None:
+    """Refuse a file that is missing or outside before hours of detection, not after."""
+    for name in _named_files(settings):
+        if not inside(settings, name).exists():
+            raise FileError(f"{name}: no such file in the project", remedy="correct the path")
+
+
 def _hashes(settings: Settings, project: Path) -> dict[str, str]:
     """Return SHA-256 of every input, by its path in the project."""
     files = {project.name: project}
+    files |= {name: inside(settings, name) for name in _named_files(settings)}
     for part in (settings.calibration, *settings.job):
-        named = [
-            part.target,
-            part.crops,
-            getattr(part, "control", None),
-            getattr(part, "truth", None),
-        ]
-        for name in filter(None, named):
-            files[name] = inside(settings, name)
         for patterns in part.images.values():
             for path in images_of(settings, patterns):
                 files[path.relative_to(settings.folder).as_posix()] = path

@@ -1,0 +1,249 @@
+"""Discs of rendered plates against exact truth; candidates in hard light; flags."""
+
+from __future__ import annotations
+
+import csv
+
+import cv2
+import numpy as np
+import pytest
+from scipy.ndimage import gaussian_filter
+
+from closerange.errors import InputError
+from closerange.features.disc_candidates import find_candidates
+from closerange.features.discs import find_discs, saturation_level
+from closerange.flags import Flag
+from closerange.geometry.ellipse import Ellipse
+from closerange.images.frame import Frame
+
+SETS = {"A_calib_discs": "white-on-dark", "B_calib_discs_black": "dark-on-white"}
+FINE = 4
+
+
+def draw(ellipses, size=(240, 200), blur_px=0.7):
+    """Share of discs in each pixel, four times finer, blurred, summed over the pixel."""
+    width, height = size
+    fine_x, fine_y = ((np.arange(n * FINE) + 0.5) / FINE - 0.5 for n in size)
+    share = np.zeros((height * FINE, width * FINE))
+    xy = np.stack(np.meshgrid(fine_x, fine_y), axis=-1)
+    for ellipse in ellipses:
+        share = np.maximum(share, np.clip(0.5 - ellipse.signed_distance(xy) * FINE, 0, 1))
+    blurred = gaussian_filter(share, blur_px * FINE, truncate=4)
+    return blurred.reshape(height, FINE, width, FINE).mean(axis=(1, 3))
+
+
+def frame_of(level, seed=1, noise=2.0):
+    level = np.asarray(level, dtype=np.float64)
+    noisy = level + np.random.default_rng(seed).normal(0, noise, level.shape)
+    return Frame("left", np.clip(np.rint(noisy), 0, 255).astype(np.uint8))
+
+
+def grid(pitch=55, radius=11, first=(60, 45)):
+    return [
+        Ellipse.of((first[0] + pitch * c + 0.3, first[1] + pitch * r - 0.2), radius, radius - 2)
+        for r in range(3)
+        for c in range(3)
+    ]
+
+
+def truth_of(folder):
+    with (folder / "targets.csv").open() as file:
+        rows = [row for row in csv.DictReader(file) if row["fully_in_image"] == "1"]
+    images = {}
+    for row in rows:
+        images.setdefault(row["image"], []).append((float(row["u_area"]), float(row["v_area"])))
+    return {name: np.array(xy) for name, xy in images.items()}
+
+
+def errors_of(discs, truth):
+    distance = np.linalg.norm(discs.xy_px[None] - truth[:, None], axis=2)
+    nearest = distance.argmin(axis=1)
+    return discs.xy_px[nearest] - truth, nearest
+
+
+@pytest.mark.parametrize("name", SETS)
+def test_rendered_plates_to_a_hundredth_of_a_pixel(shared, name):
+    folder = shared / "data" / "rendered" / name
+    images = truth_of(folder)
+    worst = 0.0
+    for image in sorted(images)[::3]:
+        frame = Frame("camera", cv2.imread(str(folder / image), cv2.IMREAD_UNCHANGED))
+        discs = find_discs(frame, polarity=SETS[name])
+        errors, _ = errors_of(discs, images[image])
+        assert len(discs) == len(images[image])
+        assert not discs.flags.any()
+        worst = max(worst, np.sqrt((errors**2).mean(axis=0)).max())
+    assert worst < 0.008  # area centroid; 0.0050 and 0.0056 px measured over all images
+
+
+def test_rendered_plate_by_border_centroids(shared):
+    folder = shared / "data" / "rendered" / "A_calib_discs"
+    images = truth_of(folder)
+    squares = []
+    for image in sorted(images)[:4]:
+        frame = Frame("camera", cv2.imread(str(folder / image), cv2.IMREAD_UNCHANGED))
+        discs = find_discs(frame, polarity="white-on-dark", estimator="border-centroid")
+        errors, rows = errors_of(discs, images[image])
+        squares.append(
+            np.einsum("ni,nij,nj->n", errors, np.linalg.inv(discs.cov_px2[rows]), errors)
+        )
+        assert np.sqrt((errors**2).mean()) < 0.12  # 0.07 px: rounding to pixels
+        assert np.isnan(discs.blur_px).all()
+    assert 1.0 < np.mean(squares) < 3.0  # 36 discs; 1.8 over the whole set
+
+
+def test_single_discs_of_the_acceptance_test(shared):
+    folder = shared / "data" / "rendered" / "A_verify" / "single"
+    with (folder / "crops.csv").open() as file:
+        crops = [row for row in csv.DictReader(file) if row["repeat"] == "0"][::6]
+    with (folder / "targets.csv").open() as file:
+        truth = {row["image"]: row for row in csv.DictReader(file)}
+    errors = []
+    for crop in crops:
+        pixels = cv2.imread(str(folder / crop["image"]), cv2.IMREAD_UNCHANGED)
+        discs = find_discs(Frame(crop["camera"], pixels), polarity="white-on-dark")
+        assert len(discs) == 1
+        row = truth[crop["image"].rsplit("_", 1)[0]]
+        place = np.array([float(row["u_area"]), float(row["v_area"])])
+        errors.append(discs.xy_px[0] + [float(crop["x0"]), float(crop["y0"])] - place)
+    assert np.sqrt(np.mean(np.square(errors))) < 0.008  # 0.0040 px over all 540 crops
+
+
+@pytest.mark.parametrize("camera", [1, 2, 3])
+def test_faint_dots_in_uneven_light(shared, camera):
+    folder = shared / "data" / "myptv-step-block"
+    frame = Frame("c", cv2.imread(str(folder / f"cal_cam{camera}.png"), cv2.IMREAD_UNCHANGED))
+    published = np.genfromtxt(folder / f"points_cam{camera}.csv", delimiter=",", names=True)
+    truth = np.column_stack([published["x"], published["y"]])
+    found = find_candidates(frame, polarity="white-on-dark")
+    centres = np.array([candidate.outline.centre for candidate in found.candidates])
+    nearest = np.linalg.norm(centres[None] - truth[:, None], axis=2).min(axis=1)
+    assert found.strategy == "local"
+    # 421 of 421, 430 of 432, 410 of 411 measured
+    assert (nearest < 1.5).mean() > 0.99
+    assert np.median(nearest) < 0.3  # 0.17, 0.17, 0.22 px: real dots, intensity centroids
+
+
+@pytest.mark.parametrize("polarity", ["white-on-dark", "dark-on-white"])
+def test_drawn_discs_come_back(polarity):
+    ellipses = grid()
+    level = 50 + 130 * draw(ellipses)
+    level = level if polarity == "white-on-dark" else 255 - level
+    discs = find_discs(frame_of(level), polarity=polarity)
+    assert len(discs) == 9
+    truth = np.array([ellipse.centre for ellipse in ellipses])
+    errors, rows = errors_of(discs, truth)
+    assert np.abs(errors).max() < 0.03
+    np.testing.assert_allclose(discs.ellipse[rows, :2], np.tile([11, 9], (9, 1)), atol=0.06)
+    assert not discs.flags.any()
+    assert (np.sign(discs.contrast) == (1 if polarity == "white-on-dark" else -1)).all()
+    assert (np.diff(discs.xy_px[:, 1]) > -30).all()  # from top to bottom
+
+
+def test_discs_in_the_shade_are_not_lost():
+    """Light that falls off to a tenth: one threshold for all misses some, auto does not."""
+    ellipses = grid()
+    light = np.exp(-np.linspace(0, 2.3, 240))[None, :]
+    frame = frame_of((40 + 170 * draw(ellipses)) * light)
+    truth = np.array([ellipse.centre for ellipse in ellipses])
+    counts = {}
+    for strategy in ("global", "auto", "local"):
+        discs = find_discs(frame, polarity="white-on-dark", strategy=strategy)
+        distance = np.linalg.norm(discs.xy_px[None] - truth[:, None], axis=2).min(axis=1)
+        counts[strategy] = int((distance < 0.1).sum())
+    assert counts["global"] < 9
+    assert counts["auto"] == counts["local"] == 9
+
+
+def test_other_shapes_are_not_candidates():
+    image = np.full((200, 240), 50.0)
+    image[30:70, 30:70] = 180  # a square
+    cv2.fillPoly(image, [np.array([[100, 30], [150, 30], [125, 75]])], 180)  # a triangle
+    cv2.circle(image, (195, 50), 22, 180, 6)  # a ring
+    image[120:124, 20:120] = 180  # a line
+    cv2.circle(image, (60, 165), 15, 180, -1)  # two discs that touch
+    cv2.circle(image, (88, 165), 15, 180, -1)
+    image += 130 * draw([Ellipse.of((180.4, 150.2), 16, 12, 0.3)])
+    frame = frame_of(image)
+    found = find_discs(frame, polarity="white-on-dark")
+    good = found.flags == 0
+    assert good.sum() == 1
+    np.testing.assert_allclose(found.xy_px[good][0], (180.4, 150.2), atol=0.05)
+
+
+def test_empty_image_gives_no_discs_under_any_option():
+    frame = frame_of(np.full((120, 160), 90.0))
+    for strategy in ("auto", "global", "local"):
+        for estimator in ("least-squares", "border-centroid"):
+            discs = find_discs(
+                frame, polarity="white-on-dark", strategy=strategy, estimator=estimator
+            )
+            assert len(discs) == 0
+            assert discs.xy_px.shape == (0, 2)
+            assert discs.cov_px2.shape == (0, 2, 2)
+    flat = Frame("c", np.full((40, 50), 7, np.uint8))
+    assert len(find_discs(flat, polarity="dark-on-white")) == 0
+
+
+def test_cut_discs_are_flagged_not_dropped():
+    ellipses = [Ellipse.of((4.0, 100.0), 14, 14), Ellipse.of((120.0, 100.0), 14, 14)]
+    discs = find_discs(frame_of(50 + 130 * draw(ellipses)), polarity="white-on-dark")
+    assert len(discs) == 2
+    cut = discs.xy_px[:, 0] < 20
+    assert (discs.flags[cut] & Flag.at_border).all()
+    assert not (discs.flags[~cut] & Flag.at_border).any()
+
+
+def flags_of(level, **options):
+    discs = find_discs(frame_of(level, **options), polarity="white-on-dark")
+    assert len(discs) == 1
+    return Flag(int(discs.flags[0]))
+
+
+def test_flags_name_the_defect():
+    one = [Ellipse.of((120.3, 99.6), 14, 12, 0.2)]
+    assert flags_of(50 + 130 * draw(one)) == Flag.none
+    assert flags_of(50 + 260 * draw(one)) == Flag.saturated
+    assert flags_of(50 + 130 * draw(one, blur_px=8.0)) == Flag.blurred
+    assert flags_of(50 + 16 * draw(one), noise=4.0) == Flag.low_contrast
+    fringed = draw(one) + 0.4 * draw([Ellipse.of((124, 99.6), 16, 12, 0.2)], blur_px=2.0)
+    assert flags_of(30 + 130 * fringed) & Flag.poor_fit
+
+
+def test_saturation_level_is_that_of_the_sensor():
+    assert saturation_level(Frame("c", np.zeros((4, 4), np.uint8))) == 255
+    deep = np.zeros((4, 4), np.uint16)
+    assert saturation_level(Frame("c", deep)) == 65535
+    for value in (1023, 4095, 16383, 4095 << 4):
+        deep[0, 0] = value
+        assert saturation_level(Frame("c", deep)) == value
+    deep[0, 0] = 5000
+    assert saturation_level(Frame("c", deep)) == 65535
+
+
+def test_sixteen_bit_images_give_the_same_discs():
+    level = 50 + 130 * draw(grid())
+    frame = frame_of(level)
+    deep = Frame("left", frame.pixels.astype(np.uint16) * 16)
+    first, second = (find_discs(f, polarity="white-on-dark") for f in (frame, deep))
+    np.testing.assert_allclose(second.xy_px, first.xy_px, atol=1e-3)
+
+
+@pytest.mark.parametrize(
+    "options",
+    [
+        {"polarity": "grey"},
+        {"polarity": "white-on-dark", "estimator": "guess"},
+        {"polarity": "white-on-dark", "strategy": "luck"},
+    ],
+)
+def test_unknown_options_are_refused_with_the_known_ones(options):
+    with pytest.raises(InputError, match=r"remedy: use one of"):
+        find_discs(frame_of(np.zeros((20, 20))), **options)
+
+
+def test_same_input_same_output():
+    frame = frame_of(50 + 130 * draw(grid()))
+    first, second = (find_discs(frame, polarity="white-on-dark") for _ in range(2))
+    np.testing.assert_array_equal(first.xy_px, second.xy_px)
+    np.testing.assert_array_equal(first.cov_px2, second.cov_px2)
