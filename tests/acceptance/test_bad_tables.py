@@ -209,7 +209,7 @@ def test_item_35_lost_minus_is_an_outlier_with_a_hint(tables, run, tmp_path, axi
 
 @pytest.mark.xfail(
     strict=True,
-    reason="one control row ten times too far pulls the start of the robust fit: refused, unnamed",
+    reason="one far control row can still spoil the fit of a camera with a narrow view: refused",
 )
 def test_item_35_lost_decimal_point_is_an_outlier_too(tables, run, tmp_path):
     def lose(row):

@@ -79,9 +79,11 @@ def test_errors_are_near_the_bound_and_their_covariance_is_honest(radius, count)
     assert all(fit.converged for fit in fits)
     rms = np.sqrt(np.mean(errors**2))
     best = np.sqrt(np.trace(limits, axis1=1, axis2=2).mean() / 2)
-    # 1.05, 1.03, 1.07, 1.09 of the bound; 2.11, 2.01, 2.02, 1.96 measured
+    # 2000 to 4000 discs: 1.06, 1.02, 1.05, 1.10 of the bound; mean of e' C^-1 e 2.18, 1.97, 1.90,
+    # 1.99 (exact: 2), and 93.6, 95.0, 95.6, 94.7 % within the 95 % region
     assert rms < 1.15 * best, (radius, rms, best)
-    assert 1.8 < normalised(errors, covariances) < 2.2, (radius, normalised(errors, covariances))
+    chance = 3 * 2 / np.sqrt(count)  # three standard errors of the mean of chi^2 with 2 dof
+    assert abs(normalised(errors, covariances) - 2) < 0.2 + chance
 
 
 def test_result_describes_the_disc():
@@ -110,15 +112,15 @@ def test_sixteen_bits_give_the_same_centre():
     np.testing.assert_allclose(same.xy_px, fit_disc(image, ellipse).xy_px, atol=1e-4)
 
 
-@pytest.mark.parametrize(("high", "largest"), [(253.0, 2.4), (300.0, 2.5), (500.0, 2.8)])
-def test_clipping_neither_biases_nor_flatters(high, largest):
+@pytest.mark.parametrize("high", [253.0, 300.0, 500.0])
+def test_clipping_neither_biases_nor_flatters(high):
     make = partial(single, radius=10)
-    errors, covariances, _, fits = errors_of(make, 200, views=20, high=high)
+    errors, covariances, _, fits = errors_of(make, 120, views=12, high=high)
     assert all(fit.converged for fit in fits)
-    # 1.76, 2.18, 2.44 measured, 200 discs scatter by 0.14; where the whole interior is clipped, its
-    # noise is unseen and taken for that of the rest
-    assert 1.5 < normalised(errors, covariances) < largest
-    assert np.abs(errors.mean(axis=0)).max() < 4 * np.sqrt(np.mean(errors**2) / 200)
+    # 1000 discs: 1.86, 2.17, 2.47; where the whole interior is clipped, its noise is unseen and
+    # taken for that of the rest. 0.55 is three standard errors of 120 discs.
+    assert abs(normalised(errors, covariances) - 2) < 0.5 + 0.55
+    assert np.abs(errors.mean(axis=0)).max() < 4 * np.sqrt(np.mean(errors**2) / 120)
 
 
 def test_clipping_on_one_side_only_does_not_pull():

@@ -206,8 +206,10 @@ def test_flags_name_the_defect():
     assert flags_of(50 + 260 * draw(one)) == Flag.saturated
     assert flags_of(50 + 130 * draw(one, blur_px=8.0)) == Flag.blurred
     assert flags_of(50 + 16 * draw(one), noise=4.0) == Flag.low_contrast
-    fringed = draw(one) + 0.4 * draw([Ellipse.of((124, 99.6), 16, 12, 0.2)], blur_px=2.0)
-    assert flags_of(30 + 130 * fringed) & Flag.poor_fit
+    stepped = 0.6 * draw(one) + 0.4 * draw([Ellipse.of((120.3, 99.6), 18, 16, 0.2)])
+    assert flags_of(50 + 130 * stepped) & Flag.poor_fit
+    lopsided = np.maximum(draw(one), 0.4 * draw([Ellipse.of((126.0, 99.6), 14, 12, 0.2)]))
+    assert flags_of(50 + 130 * lopsided) & Flag.poor_fit
 
 
 def test_saturation_level_is_that_of_the_sensor():

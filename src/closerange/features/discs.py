@@ -29,9 +29,10 @@ SATURATED_SHARE = 0.01
 BLURRED_SHARE = 0.5
 # Below five times the noise a pixel of the disc can be mistaken for background.
 LOW_CONTRAST_SIGMAS = 5.0
-# Residuals across the edge beyond three times the noise AND 6 % of the contrast: a good image
-# of little noise shows gamma or a faint halo, which are symmetric and leave the centre alone.
-POOR_FIT_SIGMAS, POOR_FIT_SHARE = 3.0, 0.06
+# Residuals beyond twice the pixel-to-pixel noise AND 3 % of the contrast. Correlated noise (of
+# demosaicing or compression) reaches 1.5; an image of little noise shows gamma, at 1 to 2 %,
+# which is symmetric and leaves the centre alone.
+POOR_FIT_SIGMAS, POOR_FIT_SHARE = 2.0, 0.03
 # A centre that ran away from its blob by half its radius (a pixel at least) is another thing's.
 LOST_SHARE, LOST_PX = 0.5, 1.0
 # The fit needs this much background between disc and image border.
@@ -59,8 +60,8 @@ class Discs:
     noise : ndarray, shape (N,)
         Standard deviation of a pixel, grey values.
     residual : ndarray, shape (N,)
-        Residual across the edge over the noise; infinite where the fit failed, NaN from
-        "border-centroid".
+        Residual over the noise, near 1 where the model holds; infinite where the fit failed,
+        NaN from "border-centroid".
     flags : ndarray of int, shape (N,)
         `Flag` bits.
     thresholds : ThresholdReport

@@ -1,7 +1,7 @@
 """Blunders: found by data snooping, left out of the fit, kept in the residuals and explained.
 
 A point is tested with the residual it has when it takes no part in the fit, against the noise of
-the other points (Baarda's data snooping with the variance estimated; doi:10.1007/BF02521811).
+the other points (Baarda's data snooping, 1968, with the variance estimated).
 Many blunders at once inflate that noise and hide each other; then a robust fit sorts the points
 first.
 """
@@ -20,6 +20,7 @@ from closerange.rig.camera import Camera
 from closerange.rig.camera_fit import CameraFit, fit_camera, strong_parameters
 from closerange.rig.camera_start import affine_starts
 from closerange.rig.distortion import BrownIdeal
+from closerange.rig.dlt import solve_dlt
 from closerange.rig.view import View, whiten
 
 FALSE_ALARM = 0.01
@@ -46,6 +47,21 @@ REWEIGHTINGS = 15
 STEPS_PER_REWEIGHTING = 4  # the weights change again before more would pay
 SETTLED = 0.01  # relative change of the variance; the limit above is no finer
 EXCHANGES = 50
+
+SUBSET, SUBSETS = 8, 60
+"""Points of a subset (six would do, and be worse) and how many are drawn: with one point in ten
+wrong, one subset in two is clean; with one in three, one in twenty-five."""
+
+FORETOLD = 10.0
+"""Standard deviations of the noise to which a point must be predicted to be taken back."""
+
+LONELY = 4.0
+"""Times the median distance from the middle beyond which a point stands alone; the corners of
+blocks, plates and rods reach twice that distance."""
+
+FAR = 10.0
+"""Times the median miss of the best subset beyond which a point has no part in the start: lens
+distortion, which the linear solution lacks, is no reason to lose a point."""
 
 Fitter: TypeAlias = Callable[[View, Camera | None], CameraFit]
 """Estimate a camera from a view, from a start if there is one."""
@@ -92,9 +108,12 @@ def fit_without_blunders(
         All points are kept where no blunder is found, or where more than half would be left out.
     """
     everything = np.ones(len(view), dtype=bool)
-    plain = fitter(view, None)
+    try:
+        plain = fitter(view, None)
+    except GeometryError:
+        plain = _without_far_blunders(view, fitter)
     plain_px = float(np.sqrt(plain.rss_px2 / plain.dof))
-    hidden = _noise(plain) > HIDDEN * _inner_noise(plain.whitened, plain.dof)
+    hidden = _noise(plain) > HIDDEN * _inner_noise(plain.whitened, plain.dof) or _lonely(view)
     if not hidden and (snoop(plain) <= limit(plain.dof - 2, trials)).all():
         return CleanFit(plain, everything, plain_px)
     kept = _sorted_robustly(view, plain, robust_free) if hidden else everything
@@ -105,6 +124,59 @@ def fit_without_blunders(
     if np.count_nonzero(~kept) > MAX_SHARE * len(view):
         return CleanFit(plain, everything, plain_px)
     return CleanFit(fit, kept, plain_px)
+
+
+def _without_far_blunders(view: View, fitter: Fitter) -> CameraFit:
+    """Fit all points, starting from the camera that most of them agree on.
+
+    One point ten times too far away spoils the linear start of all the others; the fit that is
+    refused from there is found from a start in which that point has no part.
+    """
+    agreeing = consensus(view)
+    if agreeing is None or agreeing.all():
+        return fitter(view, None)  # refuses again, with its own reason
+    return fitter(view, fitter(view.select(agreeing), None).camera)
+
+
+def _lonely(view: View) -> bool:
+    """Whether a point lies far from the others: it drags the fit along and leaves no residual."""
+    middle = np.median(view.xyz_mm, axis=0)
+    distance = np.linalg.norm(view.xyz_mm - middle, axis=1)
+    return bool(distance.max() > LONELY * np.median(distance))
+
+
+def consensus(view: View) -> BoolArray | None:
+    """Find the points that most others agree with, by the linear solution of small subsets.
+
+    Parameters
+    ----------
+    view : View
+        Points of one camera; up to a third may be wrong by any amount.
+
+    Returns
+    -------
+    ndarray of bool, shape (N,), or None
+        Points near the subset's camera whose median miss is the least (Rousseeuw 1984,
+        doi:10.1080/01621459.1984.10477105); None if no subset gives a camera.
+    """
+    rng = np.random.default_rng(0)
+    best, miss = np.inf, None
+    for _ in range(SUBSETS):
+        rows = rng.choice(len(view), size=min(SUBSET, len(view)), replace=False)
+        try:
+            matrix = solve_dlt(view.xyz_mm[rows], view.xy_px[rows]).matrix
+        except GeometryError:
+            continue
+        image = np.column_stack([view.xyz_mm, np.ones(len(view))]) @ matrix.T
+        with np.errstate(divide="ignore", invalid="ignore"):
+            square = np.sum((image[:, :2] / image[:, 2:] - view.xy_px) ** 2, axis=1)
+        square[~(image[:, 2] > 0)] = np.inf
+        median = float(np.median(square))
+        if median < best:
+            best, miss = median, square
+    if miss is None:
+        return None
+    return np.asarray(miss <= FAR**2 * max(best, ROUNDING_PX**2))
 
 
 def snoop(fit: CameraFit) -> FloatArray:
@@ -169,7 +241,8 @@ def predicted(fit: CameraFit, view: View) -> FloatArray:
     Returns
     -------
     ndarray, shape (N,)
-        F-distributed with 2 and dof degrees of freedom.
+        F-distributed with 2 and dof degrees of freedom; infinite for points that the others
+        cannot foretell, so far away that any residual would be excused.
     """
     camera = fit.camera
     residual = view.xy_px - camera.project(view.xyz_mm)
@@ -178,6 +251,7 @@ def predicted(fit: CameraFit, view: View) -> FloatArray:
     spread = np.einsum("pin,pq->nqi", columns, fit.root)
     cov = np.eye(2) + np.einsum("nqi,nqj->nij", spread, spread)
     usable = np.isfinite(cov).all(axis=(1, 2)) & np.isfinite(white).all(axis=0)
+    usable &= np.einsum("nii->n", np.where(usable[:, None, None], cov, 0.0)) < FORETOLD**2
     cov[~usable] = np.eye(2)
     white = np.where(usable, white, 0.0)
     square = np.einsum("in,ni->n", white, np.linalg.solve(cov, white.T[..., None])[..., 0])
@@ -213,7 +287,11 @@ def _exchange(
 
 def _sorted_robustly(view: View, plain: CameraFit, free: tuple[str, ...]) -> BoolArray:
     """Keep the points that a robust fit explains: the better of two starts."""
-    starts = [affine_starts(view)[0]]
+    starts = []
+    agreeing = consensus(view)
+    if agreeing is not None and not agreeing.all():
+        starts.append(fit_camera(view.select(agreeing), free).camera)
+    starts.append(affine_starts(view)[0])
     if isinstance(plain.camera.distortion, BrownIdeal):
         starts.append(plain.camera)
     best = np.inf

@@ -1,0 +1,106 @@
+"""What a fitted disc may claim: covariance of its centre, noise, and whether the model holds."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from closerange.features.disc_band import FLAT_PIXELS, FLAT_SHARE, QUANTISATION_DN2, Band
+from closerange.features.disc_model import blur_px, density
+from closerange.geometry.arrays import BoolArray, FloatArray
+from closerange.geometry.ellipse import axes_of_shape, distance_terms
+from closerange.geometry.least_squares import LeastSquaresFit
+
+# Undulations of the outline shorter than this are damped by the blur and the pixels; with fewer
+# degrees of freedom than this their variance is known to no better than a half.
+ROUGHNESS_WAVE_PX, ROUGHNESS_DOF = 6.0, 8
+
+
+def noise_and_misfit(fit: LeastSquaresFit, band: Band) -> tuple[float, float]:
+    """Return the noise of a pixel and the largest misfit of a zone in units of it.
+
+    The weights learn from residuals, so they take a ghost, a stain or a wrong shape for noise.
+    But those change little from pixel to pixel: the differences of neighbours show the noise.
+    """
+    kept, factor = band.counted(fit)
+    outside, inside = band.inside < FLAT_SHARE, band.inside > 1 - FLAT_SHARE
+    typical = [_from_neighbours(fit, band, kept & zone) for zone in (outside, inside)]
+    scale = typical[0] + (typical[1] - typical[0]) * band.inside
+    squares = (fit.residuals[:-1] / scale) ** 2
+    zones = [squares[kept & zone] for zone in (outside, inside, ~outside & ~inside)]
+    misfit = max((float(zone.mean()) for zone in zones if zone.size >= FLAT_PIXELS), default=1.0)
+    variances = np.array(band.variances_after(fit)) * np.square(typical)
+    noise = np.sqrt(max(float(variances.mean()), QUANTISATION_DN2))
+    return float(noise), float(np.sqrt(factor * misfit))
+
+
+def _from_neighbours(fit: LeastSquaresFit, band: Band, zone: BoolArray) -> float:
+    """Noise from differences of neighbours in a row, in units of the assumed noise."""
+    pairs = (np.diff(band.xy, axis=0) == (1, 0)).all(axis=1) & zone[1:] & zone[:-1]
+    if np.count_nonzero(pairs) < FLAT_PIXELS:
+        return 1.0
+    steps = np.abs(np.diff(fit.residuals[:-1])[pairs])
+    # The upper quartile (1.15 sigma of a normal) leaves out a ghost's own edge. 0.1: rounding to
+    # grey values may leave no steps, and that is no infinite misfit.
+    return max(float(np.quantile(steps, 0.75)) / (1.1503 * float(np.sqrt(2))), 0.1)
+
+
+def centre_covariance(fit: LeastSquaresFit, band: Band) -> FloatArray:
+    """Return the covariance of the centre: what a rough outline moves, and what the levels leave open.
+
+    With all other parameters known the edge alone moves the centre, and does so by the outline's
+    roughness; what light and shape add to that comes from flat pixels, with their noise.
+    """
+    kept, factor = band.counted(fit)
+    squares = fit.residuals[:-1][kept] ** 2
+    # The weights' variances were floored by quantisation; the residuals may not undercut it.
+    floor = QUANTISATION_DN2 / min(band.variances_after(fit))
+    whole = fit.covariance()[:2, :2]
+    rough = _outline_roughness(fit, band)
+    if rough is None:
+        mean = float(squares.mean()) if squares.size else 1.0
+        return max(factor * mean, factor * _at_leverage(fit, squares, kept), floor) * whole
+    by_centre = fit.jacobian[:, :2]
+    information = by_centre.T @ by_centre
+    if not (np.isfinite(whole).all() and np.linalg.det(information) > 0):
+        return np.full((2, 2), np.inf)  # no contrast: nothing holds the centre
+    edge = np.linalg.inv(information)
+    return np.asarray(max(rough, floor) * edge + max(1.0, floor) * (whole - edge))
+
+
+def _outline_roughness(fit: LeastSquaresFit, band: Band) -> float | None:
+    """Variance of the outline's slow undulations, in units of what white noise makes.
+
+    A shift of the centre is an undulation of order 1, which the fit absorbs as it does order 2.
+    Neighbouring pixels of real images are correlated (demosaicing, compression, the lens), and
+    then the orders that remain tell the variance of order 1 where single pixels tell too little.
+    Orders faster than the blur lets through are left out; None if too few are left.
+    """
+    a, b, angle = axes_of_shape(*fit.x[2:5])
+    highest = int(np.pi * (a + b) / ROUGHNESS_WAVE_PX)
+    dof = 2 * (highest - 2)
+    if dof < ROUGHNESS_DOF:
+        return None
+    x, y = (band.xy - fit.x[:2]).T
+    cos, sin = np.cos(angle), np.sin(angle)
+    around = np.arctan2((cos * y - sin * x) / b, (cos * x + sin * y) / a)
+    distance = distance_terms(fit.x[:5], band.xy)[0]
+    edge = density(distance / blur_px(fit.x)) / band.std
+    edge = edge * band.counted(fit)[0]  # clipped pixels know nothing
+    order = np.arange(3, highest + 1)[:, None]
+    waves = edge * np.concatenate([np.cos(order * around), np.sin(order * around)])
+    power = (waves @ fit.residuals[:-1]) ** 2 / np.sum(waves**2, axis=1)
+    # dof - 2: the inverse of a variance estimate is what weights use, and this is its mean
+    return float(power.sum() / (dof - 2))
+
+
+def _at_leverage(fit: LeastSquaresFit, squares: FloatArray, kept: BoolArray) -> float:
+    """Mean squared residual, each pixel weighed by its say in the centre.
+
+    On good images this is 1 as over all pixels; where the edge itself is rough, it tells.
+    """
+    covariance = fit.covariance()
+    if not np.isfinite(covariance).all():
+        return np.inf
+    say = ((fit.jacobian[:-1][kept] @ covariance[:, :2]) ** 2).sum(axis=1)
+    total = float(say.sum())
+    return float(say @ squares) / total if 0 < total < np.inf else np.inf
