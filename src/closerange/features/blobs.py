@@ -151,7 +151,8 @@ def _moment_outline(blob: Blob) -> Ellipse:
 
 def _cut_outline(border: IntArray, shape: tuple[int, ...]) -> Ellipse:
     """Ellipse through the part of a border that is not the image's, half a pixel outside it."""
-    inner = fit_ellipse(_not_at_rim(border, shape))
+    # a guess for the grey-level fit, and most of what touches the border is no ellipse anyway
+    inner = fit_ellipse(_not_at_rim(border, shape), max_iterations=5)
     a, b, angle = inner.axes
     return Ellipse.of(inner.centre, a + 0.5, b + 0.5, angle)
 

@@ -17,9 +17,10 @@ from closerange.features.disc_model import (
     blur_px,
     density,
     grey_values,
+    outline_of,
 )
 from closerange.geometry.arrays import BoolArray, FloatArray
-from closerange.geometry.ellipse import Ellipse, distance_terms
+from closerange.geometry.ellipse import Ellipse
 from closerange.geometry.least_squares import LeastSquaresFit
 
 # Half-width of the fitted band: within 3 sigma of blur the edge is complete to 0.1 % of the
@@ -71,7 +72,7 @@ class Crop:
         self, x: FloatArray, variances: tuple[float, float] | None, full_scale: float
     ) -> Band | None:
         """Choose the pixels along the edge; None if they cannot carry the parameters."""
-        distance = distance_terms(x[:5], self.xy)[0]
+        distance = outline_of(x).signed_distance(self.xy)
         blur = blur_px(x)
         at_edge = np.abs(distance) < 1
         gap = float(self.to_other[at_edge].min()) if at_edge.any() else 0.0

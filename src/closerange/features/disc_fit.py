@@ -105,9 +105,10 @@ def fit_disc(
     x = start_vector(start)
     variances: tuple[float, float] | None = None
     for _ in range(MAX_PASSES):
-        band = crop.band(x, variances, full_scale)
-        if band is None:
+        chosen = crop.band(x, variances, full_scale)
+        if chosen is None:
             return NOT_MEASURED
+        band = chosen
         if variances is None:
             x[BACKGROUND], x[CONTRAST] = band.levels()
         free = x if has_flat_middle(x) else x[:CONTRAST_SLOPES]

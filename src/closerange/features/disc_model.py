@@ -30,6 +30,11 @@ def start_vector(start: Ellipse) -> FloatArray:
     return np.array([0, 0, xx, xy, yy, np.log(USUAL_LENS_PX), 0, 0, 0, 0, 0, 0], dtype=np.float64)
 
 
+def outline_of(x: FloatArray) -> Ellipse:
+    """Return the outline, its centre counted from the start's."""
+    return Ellipse(x[:2], np.array([[x[2], x[3]], [x[3], x[4]]]))
+
+
 def grey_values(x: FloatArray, xy: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Return grey values (n,) and their Jacobian (n, p); NaN outside the model's domain."""
     if not abs(x[BLUR]) < LARGEST_LOG_BLUR:

@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 
 from closerange.features.disc_band import FLAT_PIXELS, FLAT_SHARE, QUANTISATION_DN2, Band
-from closerange.features.disc_model import blur_px, density
+from closerange.features.disc_model import blur_px, density, outline_of
 from closerange.geometry.arrays import BoolArray, FloatArray
-from closerange.geometry.ellipse import axes_of_shape, distance_terms
+from closerange.geometry.ellipse import axes_of_shape
 from closerange.geometry.least_squares import LeastSquaresFit
 
 # Undulations of the outline shorter than this are damped by the blur and the pixels; with fewer
@@ -45,7 +45,7 @@ def _from_neighbours(fit: LeastSquaresFit, band: Band, zone: BoolArray) -> float
 
 
 def centre_covariance(fit: LeastSquaresFit, band: Band) -> FloatArray:
-    """Return the covariance of the centre: what a rough outline moves, and what the levels leave open.
+    """Return the covariance of the centre: a rough outline moves it, the levels leave it open.
 
     With all other parameters known the edge alone moves the centre, and does so by the outline's
     roughness; what light and shape add to that comes from flat pixels, with their noise.
@@ -80,17 +80,21 @@ def _outline_roughness(fit: LeastSquaresFit, band: Band) -> float | None:
     dof = 2 * (highest - 2)
     if dof < ROUGHNESS_DOF:
         return None
-    x, y = (band.xy - fit.x[:2]).T
+    distance = outline_of(fit.x).signed_distance(band.xy) / blur_px(fit.x)
+    near = band.counted(fit)[0] & (np.abs(distance) < 3)  # clipped pixels know nothing
+    x, y = (band.xy[near] - fit.x[:2]).T
     cos, sin = np.cos(angle), np.sin(angle)
     around = np.arctan2((cos * y - sin * x) / b, (cos * x + sin * y) / a)
-    distance = distance_terms(fit.x[:5], band.xy)[0]
-    edge = density(distance / blur_px(fit.x)) / band.std
-    edge = edge * band.counted(fit)[0]  # clipped pixels know nothing
-    order = np.arange(3, highest + 1)[:, None]
-    waves = edge * np.concatenate([np.cos(order * around), np.sin(order * around)])
-    power = (waves @ fit.residuals[:-1]) ** 2 / np.sum(waves**2, axis=1)
+    edge = density(distance[near]) / band.std[near]
+    turning = np.exp(1j * around)
+    wave = edge * turning**2
+    power = 0.0
+    for _ in range(3, highest + 1):
+        wave = wave * turning
+        both = wave @ fit.residuals[:-1][near]
+        power += both.real**2 / np.sum(wave.real**2) + both.imag**2 / np.sum(wave.imag**2)
     # dof - 2: the inverse of a variance estimate is what weights use, and this is its mean
-    return float(power.sum() / (dof - 2))
+    return float(power / (dof - 2))
 
 
 def _at_leverage(fit: LeastSquaresFit, squares: FloatArray, kept: BoolArray) -> float:

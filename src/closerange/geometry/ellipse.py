@@ -124,10 +124,12 @@ class Ellipse:
             First-order distance (q - 1) / |grad q| with q = sqrt(p' M p): exact for circles
             and near the outline.
         """
-        p = np.asarray(xy, dtype=np.float64) - self.centre
-        w = p @ self.shape
-        square = np.einsum("...i,...i->...", p, w)
-        slope = np.sqrt(np.einsum("...i,...i->...", w, w))
+        points = np.asarray(xy, dtype=np.float64)
+        px, py = points[..., 0] - self.centre[0], points[..., 1] - self.centre[1]
+        wx = self.shape[0, 0] * px + self.shape[0, 1] * py
+        wy = self.shape[1, 0] * px + self.shape[1, 1] * py
+        square = px * wx + py * wy
+        slope = np.sqrt(wx * wx + wy * wy)
         # At the very centre the slope vanishes; -b is the limit along the minor axis.
         inside = -self.axes[1]
         return np.where(slope > 0, (square - np.sqrt(square)) / np.maximum(slope, 1e-300), inside)
@@ -165,13 +167,15 @@ def axes_of_shape(xx: float, xy: float, yy: float) -> tuple[float, float, float]
     return 1 / float(np.sqrt(small)), 1 / float(np.sqrt(large)), angle
 
 
-def fit_ellipse(xy: ArrayLike) -> Ellipse:
+def fit_ellipse(xy: ArrayLike, *, max_iterations: int = 50) -> Ellipse:
     """Fit an ellipse to points of an outline by least squares of their distances.
 
     Parameters
     ----------
     xy : array_like, shape (N, 2)
         At least five points; they need not cover the whole outline.
+    max_iterations : int, optional
+        Largest number of refining steps; 0 leaves the algebraic fit.
 
     Returns
     -------
@@ -198,7 +202,7 @@ def fit_ellipse(xy: ArrayLike) -> Ellipse:
     size = float(np.sqrt(((points - middle) ** 2).sum(axis=1).mean())) or 1.0
     p = (points - middle) / size
     start = _direct_fit(p)
-    fit = levenberg_marquardt(lambda x: _distances(x, p), start, max_iterations=50)
+    fit = levenberg_marquardt(lambda x: _distances(x, p), start, max_iterations=max_iterations)
     cx, cy, xx, xy_term, yy = fit.x
     shape = np.array([[xx, xy_term], [xy_term, yy]]) / size**2
     return Ellipse(middle + size * np.array([cx, cy]), shape)
