@@ -79,19 +79,47 @@ class Blob:
         return (*self.first, *self.mask.shape, int(np.count_nonzero(self.mask)))
 
 
-def blobs(mask: BoolArray, largest_side: float, smallest_side: float = 0.0) -> Iterator[Blob]:
-    """Give the 8-connected regions whose size could be that of a disc, from top to bottom."""
-    _, labels, stats, _ = cv2.connectedComponentsWithStats(mask.astype(np.uint8), connectivity=8)
-    width, height, area = stats[:, 2], stats[:, 3], stats[:, 4]
-    # An ellipse fills pi/4 = 0.79 of its upright bounding box, a slanted one of axis ratio 0.25
-    # still 0.37; whole pixels are a little less strict.
-    side = np.maximum(width, height)
-    fits = (side <= largest_side) & (side >= smallest_side) & (area >= SMALLEST_AREA_PX)
-    fits &= area >= 0.3 * width * height
-    fits[0] = False  # the background
-    for label in np.flatnonzero(fits):
-        x, y, w, h = (int(v) for v in stats[label, :4])
-        yield Blob(labels[y : y + h, x : x + w] == label, (x, y))
+@dataclass(frozen=True, slots=True, eq=False)
+class Regions:
+    """The 8-connected regions of a mask.
+
+    Attributes
+    ----------
+    labels : ndarray of int, shape (H, W)
+        0 for the background, then one number a region.
+    stats : ndarray of int, shape (R, 5)
+        First x, first y, width, height and area of each label.
+    """
+
+    labels: NDArray[Any]
+    stats: NDArray[Any]
+
+    @classmethod
+    def of(cls, mask: BoolArray) -> Regions:
+        """Label the regions of a mask from top to bottom."""
+        image = mask.astype(np.uint8)
+        _, labels, stats, _ = cv2.connectedComponentsWithStats(image, connectivity=8)
+        return cls(labels, stats)
+
+    def blobs(self, largest_side: float, smallest_side: float = 0.0) -> Iterator[Blob]:
+        """Give the regions whose size could be that of a disc."""
+        width, height, area = self.stats[:, 2:].T
+        # An ellipse fills pi/4 = 0.79 of its upright bounding box, a slanted one of axis ratio
+        # 0.25 still 0.37; whole pixels are a little less strict.
+        side = np.maximum(width, height)
+        fits = (side <= largest_side) & (side >= smallest_side) & (area >= SMALLEST_AREA_PX)
+        fits &= area >= 0.3 * width * height
+        fits[0] = False  # the background
+        for label in np.flatnonzero(fits):
+            x, y, w, h = (int(v) for v in self.stats[label, :4])
+            yield Blob(self.labels[y : y + h, x : x + w] == label, (x, y))
+
+    def islands(self) -> int:
+        """Count the regions that do not touch the image border and are no mere specks."""
+        height, width = self.labels.shape
+        x, y, w, h, area = self.stats[1:].T
+        inside = (x > 0) & (y > 0) & (x + w < width) & (y + h < height)
+        return int(np.count_nonzero(inside & (area >= SMALLEST_AREA_PX)))
 
 
 def refined(residue: NDArray[Any], blob: Blob, floor: float) -> Blob:
@@ -152,7 +180,7 @@ def _moment_outline(blob: Blob) -> Ellipse:
 def _cut_outline(border: IntArray, shape: tuple[int, ...]) -> Ellipse:
     """Ellipse through the part of a border that is not the image's, half a pixel outside it."""
     # a guess for the grey-level fit, and most of what touches the border is no ellipse anyway
-    inner = fit_ellipse(_not_at_rim(border, shape), max_iterations=5)
+    inner = fit_ellipse(_not_at_rim(border, shape), max_iterations=15)
     a, b, angle = inner.axes
     return Ellipse.of(inner.centre, a + 0.5, b + 0.5, angle)
 
