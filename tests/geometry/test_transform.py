@@ -10,7 +10,6 @@ from scipy.spatial.transform import Rotation
 from closerange.geometry.transform import (
     RigidTransform,
     cross_matrix,
-    nearest_rotation,
     rotation_from_vector,
 )
 
@@ -65,24 +64,3 @@ def test_what_is_not_orthonormal_is_refused():
 def test_cross_matrix():
     v, w = RNG.normal(size=(2, 3))
     np.testing.assert_allclose(cross_matrix(v) @ w, np.cross(v, w), atol=1e-15)
-
-
-def test_nearest_rotation():
-    truth = Rotation.random(random_state=RNG).as_matrix()
-    np.testing.assert_allclose(nearest_rotation(3.0 * truth), truth, atol=1e-14)
-    noisy = truth + 0.05 * RNG.normal(size=(3, 3))
-    best = nearest_rotation(noisy)
-    assert np.linalg.det(best) == pytest.approx(1)
-    distance = np.linalg.norm(noisy - best)
-    for _ in range(50):  # brute force: no neighbour is nearer
-        other = rotation_from_vector(0.01 * RNG.normal(size=3)) @ best
-        assert np.linalg.norm(noisy - other) > distance
-
-
-def test_nearest_rotation_of_a_reflection_is_proper():
-    assert np.linalg.det(nearest_rotation(np.diag([1.0, 1.0, -1.0]))) == pytest.approx(1)
-
-
-def test_nearest_rotation_of_rank_two():
-    rank_two = np.diag([1.0, 1.0, 0.0])
-    np.testing.assert_allclose(nearest_rotation(rank_two), np.eye(3), atol=1e-15)

@@ -106,22 +106,3 @@ def cross_matrix(vector: ArrayLike) -> FloatArray:
     """
     x, y, z = np.asarray(vector, dtype=np.float64)
     return np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
-
-
-def nearest_rotation(matrix: ArrayLike) -> FloatArray:
-    """Return the proper rotation nearest to a matrix in the Frobenius norm.
-
-    Parameters
-    ----------
-    matrix : array_like, shape (3, 3)
-        Any matrix of rank at least 2.
-
-    Returns
-    -------
-    ndarray, shape (3, 3)
-        Rotation with det = +1 (Kabsch, doi:10.1107/S0567739476001873).
-    """
-    u, _, vt = np.linalg.svd(np.asarray(matrix, dtype=np.float64))
-    sign = np.sign(np.linalg.det(u @ vt))
-    rotation: FloatArray = u @ np.diag([1.0, 1.0, sign]) @ vt
-    return rotation
