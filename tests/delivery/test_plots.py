@@ -68,18 +68,42 @@ def test_everything_stays_inside_the_drawing():
 
 
 @pytest.mark.parametrize(
-    ("length", "factor"), [(0.01, 2000.0), (0.016, 2000.0), (0.5, 50.0), (100.0, 0.2)]
+    ("length", "factor"), [(0.01, 5000.0), (0.016, 3000.0), (0.5, 100.0), (100.0, 0.5)]
 )
-def test_magnification_is_round_and_keeps_vectors_below_a_twentieth(length, factor):
+def test_magnification_is_round_and_keeps_vectors_off_each_other(length, factor):
     found = magnification(np.full(30, length), (640, 480))
-    assert found == pytest.approx(factor)
-    assert found * length <= 0.05 * 640 + 1e-9
+    assert found == pytest.approx(factor, rel=0.01)
+    apart = np.sqrt(640 * 480 / 30)
+    assert 0.3 * apart < found * length <= 0.5 * apart + 1e-9
+
+
+def test_magnification_of_a_few_vectors_stays_below_a_tenth_of_the_width():
+    assert 4 < magnification(np.full(270, 10.0), (640, 480), count=9) * 10.0 <= 64
+
+
+def test_counts_have_no_ticks_between_whole_numbers():
+    few = Panel(np.array([1.0, 2.0]), np.array([0.0, 1.0]), "number", "y [mm]", "few")
+    texts = _texts(panel_grid([few], columns=1, height=150, title="t", description="d"))
+    assert {"1", "2"} <= set(texts)
+    assert "1.5" not in texts
+    part = Panel(np.array([0.5, 2.0]), np.array([0.0, 1.0]), "x [mm]", "y [mm]", "part")
+    assert "1.4" in _texts(panel_grid([part], columns=1, height=150, title="t", description="d"))
+
+
+def test_bars_reach_as_far_as_stated_and_unknown_ones_are_left_out():
+    y, half = np.array([0.0, 1.0, 2.0]), np.array([1.0, np.nan, 2.0])
+    panel = Panel(np.arange(1.0, 4.0), y, "n", "y [mm]", "bars", colour="#123456", spread=half)
+    root = _parse(panel_grid([panel], columns=1, height=200, title="t", description="d"))
+    bars = [line for line in root.iter("line") if line.get("stroke") == "#123456"]
+    lengths = [abs(float(bar.get("y1")) - float(bar.get("y2"))) for bar in bars]
+    assert len(bars) == 2
+    assert lengths[1] == pytest.approx(2 * lengths[0], rel=0.01)
 
 
 def test_magnification_survives_blunders_and_nothing():
     lengths = np.full(30, 0.01)
     lengths[0] = 50.0
-    assert magnification(lengths, (640, 480)) == pytest.approx(2000)
+    assert magnification(lengths, (640, 480)) == magnification(lengths[1:], (640, 480))
     assert magnification([np.nan, 0.0], (640, 480)) == 1.0
 
 

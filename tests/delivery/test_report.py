@@ -9,6 +9,8 @@ import pytest
 from closerange.delivery.excerpts import coverage_word
 from closerange.delivery.overlays import make_overlay
 from closerange.delivery.report import render_report
+from closerange.delivery.sheet import Terms
+from closerange.delivery.single_point_section import single_point_blocks
 from closerange.delivery.wording import DASH
 from closerange.flags import Flag
 from closerange.images.frame import Frame
@@ -191,7 +193,7 @@ def test_first_page_has_verdict_picture_and_figures_with_units(html):
     assert front.count("<svg") == 1
     assert "predicted error in space (one standard deviation) [µm]" in words
     assert "Accuracy" in words
-    assert "±20 µm (reference)" in words
+    assert "±20 µm of the reference" in words
     assert "50 µm" in words
     assert "rejected" in words
 
@@ -268,7 +270,7 @@ def test_tables_show_the_data(html, rig, positions):
     assert rows[0][head.index("X [mm]")] == f"{positions.xyz_mm[0, 0]:.3f}"
     assert rows[4][3:7] == [DASH] * 4
     assert rows[4][-1] == "single_view"
-    _, rows = tables["inputs"]
+    _, rows = tables["Input files"]
     assert rows == [["points &lt;1&gt;.csv", "ab" * 32]]
 
 
@@ -294,7 +296,7 @@ def test_long_tables_are_cut_and_say_so():
         ("",) * count,
     )
     page = render_report(title="Many", positions=positions)
-    caption, _, rows = next(table for table in _tables(page) if table[0].startswith("Measured"))
+    caption, _, rows = next(table for table in _tables(page) if "first 200" in table[0])
     assert "first 200 of 350 rows" in caption
     assert "CSV" in caption
     assert len(rows) == 200
@@ -341,7 +343,9 @@ def test_fixed_parameters_are_listed_with_their_reason(rig):
     assert rows[0] == ["left", "focal length along x", "fx", "2000.0", "1.2", "px", "free"]
     assert rows[2][3:5] == [DASH, "0.00010"]
     assert rows[4][3:] == ["0", DASH, "pure\u00a0number", "fixed: 0: no wide lens"]
-    assert next(table for table in _tables(page) if table[0] == "cameras")[2][0] == ["left", "27"]
+    assert ["left", "27"] in next(
+        rows for caption, head, rows in _tables(page) if (caption, head[0]) == ("Cameras", "name")
+    )
 
 
 @pytest.mark.parametrize(
@@ -370,9 +374,19 @@ def test_too_small_uncertainties_are_said_in_the_verdict(control_check):
 
 
 def test_the_name_of_a_job_is_said(length_check):
-    page = render_report(title="Jobs", checks=[{**length_check.to_document(), "job": "bars <1>"}])
+    check = length_check.to_document()
+    page = render_report(
+        title="Jobs", checks=[{**check, "job": "bars <1>"}, {**check, "job": "lengths"}]
+    )
     assert "Lengths: bars <1>" in _words(page)
     assert "Error of 1 length (rms), bars <1>" in _words(page)
+    # a job named as its kind would only be said twice
+    assert re.findall(r"<h2>\d+\. (Lengths.*?)</h2>", page) == [
+        "Lengths: bars &lt;1&gt;",
+        "Lengths",
+    ]
+    alone = render_report(title="Jobs", checks=[{**check, "job": "bars"}])
+    assert "(rms), bars" not in alone
 
 
 def test_only_the_name_of_a_picture_file_is_shown(overlays):
@@ -380,3 +394,15 @@ def test_only_the_name_of_a_picture_file_is_shown(overlays):
     page = render_report(title="Pictures", overlays=moved)
     assert "(left 1.png)" in _words(page)
     assert "somebody" not in page
+
+
+def test_repeatability_is_compared_with_image_noise_where_it_is_stated(acceptance):
+    document = acceptance.to_document()
+    texts = []
+    for stated in (True, False):
+        prediction = document["prediction"] | {"noise_stated": stated}
+        _, blocks = single_point_blocks(document | {"prediction": prediction})
+        entries = [dict(block.entries) for block in blocks if isinstance(block, Terms)]
+        texts += [found["Observed / predicted"] for found in entries]
+    assert texts[0].endswith("(Z), predicted from image noise.")
+    assert texts[1].endswith("(Z), predicted for all errors of a reading together, hence below 1.")

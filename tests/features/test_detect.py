@@ -100,6 +100,13 @@ def test_rows_carry_names_sizes_and_diameters():
     assert np.abs(points.xy_px - expected).max() < 0.05
     assert np.abs(points.ellipse[:, 0] / (2 * grid.diameters_mm) - 1).max() < 0.02
     assert (np.linalg.eigvalsh(points.cov_px2) > 0).all()
+    assert (np.linalg.eigvalsh(points.noise_cov_px2) > 0).all()
+
+
+def test_border_centroids_state_no_noise():
+    points = detect_target(Frame("a", drawn(PLAIN)), PLAIN, estimator="border-centroid")
+    assert np.isfinite(points.cov_px2).all()
+    assert np.isnan(points.noise_cov_px2).all()
 
 
 def test_a_missing_inner_disc_is_a_row_without_position():
@@ -110,6 +117,7 @@ def test_a_missing_inner_disc_is_a_row_without_position():
     assert points.flags[4] == Flag.not_found
     assert np.isnan(points.xy_px[4]).all()
     assert np.isnan(points.cov_px2[4]).all()
+    assert np.isnan(points.noise_cov_px2[4]).all()
     assert points.found.sum() == 8
     assert not np.delete(points.flags, 4).any()
 

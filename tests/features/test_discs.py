@@ -136,6 +136,7 @@ def test_drawn_discs_come_back(polarity):
     assert np.abs(errors).max() < 0.03
     np.testing.assert_allclose(discs.ellipse[rows, :2], np.tile([11, 9], (9, 1)), atol=0.06)
     assert not discs.flags.any()
+    assert (np.linalg.eigvalsh(discs.noise_cov_px2) > 0).all()
     assert (np.sign(discs.contrast) == (1 if polarity == "white-on-dark" else -1)).all()
     assert (np.diff(discs.xy_px[:, 1]) > -30).all()  # from top to bottom
 
@@ -180,7 +181,7 @@ def test_empty_image_gives_no_discs_under_any_option():
             )
             assert len(discs) == 0
             assert discs.xy_px.shape == (0, 2)
-            assert discs.cov_px2.shape == (0, 2, 2)
+            assert discs.cov_px2.shape == discs.noise_cov_px2.shape == (0, 2, 2)
     flat = Frame("c", np.full((40, 50), 7, np.uint8))
     assert len(find_discs(flat, polarity="dark-on-white")) == 0
 

@@ -18,7 +18,8 @@ def test_what_is_not_known_is_nan_blank_or_zero():
     points = two()
     assert points.placement == points.reading == ("", "")
     assert points.flags.tolist() == [0, 0]
-    for name, shape in (("cov_px2", (2, 2, 2)), ("ellipse", (2, 3)), ("disc_diameter_mm", (2,))):
+    matrices = (("cov_px2", (2, 2, 2)), ("noise_cov_px2", (2, 2, 2)))
+    for name, shape in (*matrices, ("ellipse", (2, 3)), ("disc_diameter_mm", (2,))):
         assert getattr(points, name).shape == shape
         assert np.isnan(getattr(points, name)).all()
     assert points.size_px == {}
@@ -90,6 +91,18 @@ def test_select_by_mask_and_by_index():
     assert len(points.select([])) == 0
 
 
+def test_noise_keeps_its_row():
+    noise = np.array([np.eye(2), 2 * np.eye(2)])
+    joined = two("left", noise_cov_px2=noise) + two("right")
+    np.testing.assert_array_equal(joined.noise_cov_px2[:2], noise)
+    assert np.isnan(joined.noise_cov_px2[2:]).all()
+    assert joined.select([3, 1]).noise_cov_px2[1, 0, 0] == 2
+    with pytest.raises(ValueError, match="read-only"):
+        joined.noise_cov_px2[0, 0, 0] = 5
+    with pytest.raises(ValueError):
+        two(noise_cov_px2=np.zeros((3, 2, 2)))
+
+
 def test_found():
     points = ImagePoints.of(
         camera="c", point=["a", "b", "c"], xy_px=[[1, 2], [np.nan, np.nan], [1, np.nan]]
@@ -99,11 +112,15 @@ def test_found():
 
 def test_a_crop_changes_nothing_but_the_position():
     points = two(
-        cov_px2=np.eye(2), ellipse=[5.0, 4.0, 0.3], flags=[1, 2], size_px={"left": (640, 480)}
+        noise_cov_px2=np.eye(2) / 3,
+        cov_px2=np.eye(2),
+        ellipse=[5.0, 4.0, 0.3],
+        flags=[1, 2],
+        size_px={"left": (640, 480)},
     )
     moved = points.shifted([100, 50])
     assert moved.xy_px.tolist() == [[101, 52], [103, 54]]
-    for name in ("cov_px2", "ellipse", "flags"):
+    for name in ("cov_px2", "noise_cov_px2", "ellipse", "flags"):
         assert (getattr(moved, name) == getattr(points, name)).all()
     assert moved.keys() == points.keys()
     assert moved.size_px == {}

@@ -34,12 +34,13 @@ def rich():
         flags=[0, int(Flag.not_found), int(Flag.saturated | Flag.at_border), 0],
         ellipse=[[5, 5, 0], [np.nan] * 3, [5.5, 4.4, -1.2], [2, 1, 3]],
         disc_diameter_mm=[16, np.nan, 8.3, 1],
+        noise_cov_px2=[np.eye(2) / 7, np.full((2, 2), np.nan), [[1, -0.5], [-0.5, 1]], np.eye(2)],
     )
 
 
 def assert_same(one, other):
     assert one.keys() == other.keys()
-    for name in ("xy_px", "cov_px2", "flags", "ellipse", "disc_diameter_mm"):
+    for name in ("xy_px", "cov_px2", "noise_cov_px2", "flags", "ellipse", "disc_diameter_mm"):
         np.testing.assert_array_equal(getattr(one, name), getattr(other, name))
 
 
@@ -141,9 +142,11 @@ def test_bad_numbers_name_their_cell(read, cell):
     ],
 )
 def test_what_is_not_a_covariance_is_refused(read, terms):
-    header = "camera,point,x_px,y_px,cov_xx_px2,cov_xy_px2,cov_yy_px2"
-    with pytest.raises(TableError, match=r"row 2, column 'cov_xx_px2': .* is not a covariance"):
-        read(f"{header}\nleft,1,1,1,{terms}\n")
+    for kind in ("cov", "noise"):
+        header = f"camera,point,x_px,y_px,{kind}_xx_px2,{kind}_xy_px2,{kind}_yy_px2"
+        message = f"row 2, column '{kind}_xx_px2': .* is not a covariance"
+        with pytest.raises(TableError, match=message):
+            read(f"{header}\nleft,1,1,1,{terms}\n")
 
 
 def test_some_rows_may_have_a_covariance(read):
@@ -151,6 +154,14 @@ def test_some_rows_may_have_a_covariance(read):
     points = read(f"{header}\nleft,1,1,1,2,-1,3\nleft,2,1,1,,,\n")
     assert points.cov_px2[0].tolist() == [[2, -1], [-1, 3]]
     assert np.isnan(points.cov_px2[1]).all()
+
+
+def test_noise_is_read_apart_from_the_covariance(read):
+    header = "camera,point,x_px,y_px,noise_xx_px2,noise_xy_px2,noise_yy_px2"
+    points = read(f"{header}\nleft,1,1,1,2,-1,3\nleft,2,1,1,,,\n")
+    assert points.noise_cov_px2[0].tolist() == [[2, -1], [-1, 3]]
+    assert np.isnan(points.noise_cov_px2[1]).all()
+    assert np.isnan(points.cov_px2).all()
 
 
 @pytest.mark.parametrize("terms", ["4,5,0", "0,0,0", "5,-4,0", "5,,0", "5,4,"])

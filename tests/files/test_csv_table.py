@@ -10,7 +10,16 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from closerange.errors import CloseRangeWarning, FileError, TableError
-from closerange.files.csv_table import float_cell, float_text, read_csv, text_cell, write_csv
+from closerange.files.csv_table import (
+    check_unique,
+    flag_cell,
+    float_cell,
+    float_text,
+    read_csv,
+    text_cell,
+    write_csv,
+)
+from closerange.flags import Flag
 
 
 @pytest.fixture
@@ -171,6 +180,28 @@ def test_blank_cells():
     with pytest.raises(TableError, match="here: the cell is empty"):
         text_cell("", "here")
     assert text_cell("01", "here") == "01"
+
+
+def test_flags_are_names():
+    assert flag_cell("", "here") == Flag.none
+    assert flag_cell("blurred|at_border", "here") == Flag.blurred | Flag.at_border
+    with pytest.raises(TableError, match="here: unknown flag 'bad'") as caught:
+        flag_cell("bad", "here")
+    assert "registry" in caught.value.remedy
+
+
+def test_two_rows_of_one_name_are_both_named(table):
+    read = table("a,b,c\nx,1,\nx,2,\n\nx,1,\n")
+    with pytest.raises(TableError, match=r"row 5, column 'a': a 'x', b '1' is also in row 2") as c:
+        check_unique(read, ("a", "b"), remedy="remove one")
+    assert c.value.remedy == "remove one"
+
+
+def test_rows_that_differ_in_one_column_of_the_key_are_unique(table):
+    read = table("a,b\nx,1\nx,01\n")
+    check_unique(read, ("a", "b"), remedy="")
+    with pytest.raises(TableError, match="is also in row 2"):
+        check_unique(read, ("a", "c"), remedy="")  # a missing column is blank in every row
 
 
 def test_numbers_do_not_follow_the_locale():

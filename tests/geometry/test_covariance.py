@@ -5,7 +5,13 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from closerange.geometry.covariance import mahalanobis_squared, propagate, region_limit
+from closerange.geometry.covariance import (
+    limited_part,
+    mahalanobis_squared,
+    positive_definite,
+    propagate,
+    region_limit,
+)
 
 RNG = np.random.default_rng(8)
 
@@ -48,6 +54,42 @@ def test_region_limits_are_those_of_tables(dimensions, dof, limit):
 def test_known_variance_is_the_limit_of_many_degrees_of_freedom():
     assert region_limit(3, 10**9) == pytest.approx(region_limit(3, None), rel=1e-6)
     assert region_limit(3, None, probability=0.5) < region_limit(3, None)
+
+
+def test_positive_definite_needs_every_number():
+    cov = definite(4, 3)
+    cov[1, 0, 0], cov[2] = np.nan, -cov[2]
+    cov[3] = np.ones((3, 3))
+    cov[3, 2, 2] = 0.5  # an eigenvalue of 0 and one below
+    assert positive_definite(cov).tolist() == [True, False, False, False]
+    assert positive_definite(np.empty((0, 3, 3))).shape == (0,)
+
+
+def test_a_part_within_the_whole_stays_as_it_is():
+    part = definite(5, 3)
+    np.testing.assert_allclose(limited_part(part, part + definite(5, 3)), part, rtol=1e-10)
+
+
+def test_a_part_is_shortened_only_where_it_exceeds_the_whole():
+    whole = np.diag([1.0, 4.0, 9.0])[None]
+    part = np.diag([0.5, 5.0, 9.0])[None]
+    np.testing.assert_allclose(limited_part(part, whole), np.diag([0.5, 4.0, 9.0])[None])
+    turn = np.linalg.qr(RNG.normal(size=(3, 3)))[0]
+    turned = limited_part(turn @ part @ turn.T, turn @ whole @ turn.T)
+    np.testing.assert_allclose(turned, [turn @ np.diag([0.5, 4.0, 9.0]) @ turn.T], atol=1e-12)
+
+
+def test_any_part_leaves_a_rest_that_is_a_covariance():
+    part, whole = definite(200, 3), definite(200, 3)
+    rest = whole - limited_part(part, whole)
+    assert np.linalg.eigvalsh(rest).min() > -1e-10
+    assert np.linalg.eigvalsh(whole - part).min() < -1
+
+
+def test_a_part_of_what_is_unknown_is_unknown():
+    part, whole = definite(3, 2), definite(3, 2)
+    part[0, 0, 0], whole[2, 1, 1] = np.nan, -1
+    assert np.isnan(limited_part(part, whole)).all(axis=(1, 2)).tolist() == [True, False, True]
 
 
 def test_propagate_is_exact_for_linear_maps_and_symmetric():

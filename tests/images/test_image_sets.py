@@ -11,7 +11,6 @@ from closerange.errors import InputError
 from closerange.images import (
     Frame,
     check_duplicates,
-    check_simultaneous,
     check_sizes,
     group_images,
     placement_and_reading,
@@ -147,15 +146,3 @@ def test_sizes_and_depths_must_agree_within_a_camera():
         check_sizes([frame(), frame(source="b.png", shape=(9, 6))])
     with pytest.raises(InputError, match=r"\(uint16\).*\(uint8\)"):
         check_sizes([frame(), frame(dtype=np.uint16)])
-
-
-def test_exposures_must_lie_within_the_tolerance():
-    frames = [frame("a", "a.png", 10.0), frame("b", "b.png", 10.004), frame("c", "c.png")]
-    check_simultaneous(frames, tolerance_s=0.005)
-    check_simultaneous(frames[1:], tolerance_s=0.0)
-    with pytest.raises(InputError, match=r"a\.png .*b\.png .*0\.004 s apart, the limit is 0\.003"):
-        check_simultaneous(frames, tolerance_s=0.003)
-    with pytest.raises(InputError, match="tolerance_s is nan"):
-        check_simultaneous(frames, tolerance_s=float("nan"))
-    with pytest.raises(InputError, match="its time is inf"):
-        check_simultaneous([frame(time_s=float("inf"))], tolerance_s=1)

@@ -330,6 +330,45 @@ def test_the_unit_of_length_does_not_matter(scale):
     assert (two.flags == one.flags).all()
 
 
+def with_noise(points, seed=3):
+    """State a noise for each row that is a part of its covariance, correlated and unequal."""
+    root = np.random.default_rng(seed).normal(size=(len(points), 2, 2)) * 0.02
+    noise = root @ np.swapaxes(root, 1, 2) + 1e-4 * np.eye(2)
+    return replace(points, noise_cov_px2=noise, cov_px2=noise + 0.01**2 * np.eye(2))
+
+
+def test_noise_is_carried_through_the_derivatives_of_the_position():
+    rig = three_cameras().true_rig()
+    points = with_noise(seen(rig, [[5.0, 6, 7], [-20, 3, 9]], noise_px=0.02))
+    positions = measure_points(rig, points)
+    expected = np.zeros((2, 3, 3))
+    step = 1e-3
+    for row in range(len(points)):
+        shift = np.zeros((2, *points.xy_px.shape))
+        shift[(0, 1), row, (0, 1)] = step
+        ahead, back = (
+            np.array([measure_points(rig, replace(points, xy_px=xy)).xyz_mm for xy in moved])
+            for moved in (points.xy_px + shift, points.xy_px - shift)
+        )
+        slopes = (ahead - back) / (2 * step)  # (2, points, 3)
+        expected += np.einsum("imk,ij,jml->mkl", slopes, points.noise_cov_px2[row], slopes)
+    np.testing.assert_allclose(positions.noise_cov_mm2, expected, rtol=1e-3, atol=1e-7)
+    assert np.linalg.eigvalsh(positions.cov_mm2 - positions.noise_cov_mm2).min() > 0
+
+
+def test_noise_is_unknown_unless_every_view_that_is_used_states_it():
+    rig = three_cameras().true_rig()
+    points = with_noise(seen(rig, [[5.0, 6, 7], [-20, 3, 9], [0, 0, 0]]))
+    noise = points.noise_cov_px2.copy()
+    noise[0] = noise[1] = np.nan
+    flags = points.flags.copy()
+    flags[1] = int(Flag.blurred)  # left out: two other views see the second point
+    positions = measure_points(rig, replace(points, noise_cov_px2=noise, flags=flags))
+    known = np.isfinite(positions.noise_cov_mm2).all(axis=(1, 2))
+    assert known.tolist() == [False, True, True]
+    assert np.isfinite(positions.cov_mm2).all()
+
+
 def test_discs_are_measured_at_their_centres():
     """A large tilted disc: its image centre lies 0.18 mm off in space, its position does not."""
     rig = rig_b().true_rig()

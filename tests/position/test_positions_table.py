@@ -16,7 +16,10 @@ HEADER = (
 )
 
 
-def positions(reading=("", "", "")):
+NOISE = "noise_xx_mm2,noise_xy_mm2,noise_xz_mm2,noise_yy_mm2,noise_yz_mm2,noise_zz_mm2"
+
+
+def positions(reading=("", "", ""), *, noise=False):
     rng = np.random.default_rng(1)
     root = rng.normal(size=(3, 3, 3))
     cov = root @ np.swapaxes(root, 1, 2)
@@ -33,6 +36,7 @@ def positions(reading=("", "", "")):
         cameras=np.array([2, 1, 3]),
         flags=np.array([0, int(Flag.single_view), int(Flag.residual | Flag.blurred)]),
         reading=reading,
+        noise_cov_mm2=cov / 7 if noise else np.array(np.nan),
     )
 
 
@@ -59,23 +63,32 @@ def test_reading_joins_the_key_when_there_is_one(tmp_path):
     assert read_positions(tmp_path / "p.csv").reading == ("1", "1", "2")
 
 
+@pytest.mark.parametrize("noise", [False, True])
 @pytest.mark.parametrize("reading", [("", "", ""), ("1", "1", "2")])
-def test_round_trip_is_exact_and_byte_identical(tmp_path, reading):
-    written = positions(reading)
+def test_round_trip_is_exact_and_byte_identical(tmp_path, reading, noise):
+    written = positions(reading, noise=noise)
     written.to_csv(tmp_path / "a.csv")
     back = read_positions(tmp_path / "a.csv")
     assert back.keys() == written.keys()
-    for name in ("xyz_mm", "cov_mm2", "residual_px", "cameras", "flags"):
+    for name in ("xyz_mm", "cov_mm2", "noise_cov_mm2", "residual_px", "cameras", "flags"):
         np.testing.assert_array_equal(getattr(back, name), getattr(written, name))
     assert back.dof is None
     write_positions(back, tmp_path / "b.csv")
     assert (tmp_path / "a.csv").read_bytes() == (tmp_path / "b.csv").read_bytes()
 
 
+def test_noise_has_columns_where_there_is_any(tmp_path):
+    positions(noise=True).to_csv(tmp_path / "p.csv")
+    header = (tmp_path / "p.csv").read_text().splitlines()[0]
+    assert header == HEADER.replace(",residual_px", f",{NOISE},residual_px")
+
+
 def test_five_columns_are_enough(read):
     back = read("z_mm,y_mm,x_mm,point,placement\n3,2,1,a,\n")
     assert back.xyz_mm.tolist() == [[1, 2, 3]]
     assert np.isnan(back.cov_mm2).all()
+    assert back.noise_cov_mm2.shape == (1, 3, 3)
+    assert np.isnan(back.noise_cov_mm2).all()
     assert back.cameras.tolist() == [0]
     assert back.measured.tolist() == [True]
 
@@ -99,6 +112,8 @@ def test_a_row_that_appears_twice(read):
 def test_what_is_not_a_covariance_is_refused(read, terms):
     with pytest.raises(TableError, match=r"row 2, .*positive definite"):
         read(f"{HEADER}\n,a,1,2,3,{terms},0.1,2,\n")
+    with pytest.raises(TableError, match=r"row 2, column 'noise_xx_mm2': .*positive definite"):
+        read(f"placement,point,x_mm,y_mm,z_mm,{NOISE}\n,a,1,2,3,{terms}\n")
 
 
 @pytest.mark.parametrize("count", ["1.5", "-1", "x"])
@@ -115,7 +130,8 @@ def test_unknown_flags_and_columns(read):
 
 
 def test_select():
-    whole = positions()
+    whole = positions(noise=True)
+    np.testing.assert_array_equal(whole.select([2, 0]).noise_cov_mm2, whole.noise_cov_mm2[[2, 0]])
     assert whole.select(whole.measured).point == ("a", "1")
     assert whole.select([2, 0]).flags.tolist() == [int(Flag.residual | Flag.blurred), 0]
     assert len(whole.select([])) == 0

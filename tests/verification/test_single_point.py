@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -108,6 +110,63 @@ def test_prediction_splits_calibration_and_noise(stated):
     against = 1.0 if stated else np.sqrt(0.8)
     assert report.prediction.repeatability_ratio == pytest.approx(np.full(4, against), rel=0.05)
     assert report.prediction.noise_stated is stated
+
+
+def test_noise_comes_from_the_positions_if_all_readings_state_it(simulated):
+    truth, _, xyz = simulated
+    positions = readings_of(truth, xyz, cov=(BIAS**2 + 0.012**2) * np.eye(3))
+    stated = np.broadcast_to(np.diag(NOISE**2), (len(positions), 3, 3)).copy()
+    carried = single_point_test(replace(positions, noise_cov_mm2=stated), truth)
+    given = single_point_test(positions, truth, noise_cov_mm2=stated)
+    assert carried.prediction.noise_stated
+    np.testing.assert_array_equal(carried.predicted_cov_mm2, given.predicted_cov_mm2)
+    # 810 degrees of freedom: 2.5 % standard error
+    assert carried.prediction.repeatability_ratio == pytest.approx(np.ones(4), abs=0.08)
+    stated[17] = np.nan
+    assert not single_point_test(
+        replace(positions, noise_cov_mm2=stated), truth
+    ).prediction.noise_stated
+
+
+def test_noise_of_a_reading_that_is_left_out_need_not_be_known(simulated):
+    truth, _, xyz = simulated
+    flags = np.zeros(xyz.shape[:2], np.int64)
+    flags[3, 17] = int(Flag.residual)
+    positions = readings_of(truth, xyz, cov=np.eye(3), flags=flags.ravel())
+    stated = np.broadcast_to(np.diag(NOISE**2), (len(positions), 3, 3)).copy()
+    stated[flags.ravel() != 0] = np.nan
+    with pytest.warns(UserWarning, match="1 flagged readings were left out"):
+        report = single_point_test(replace(positions, noise_cov_mm2=stated), truth)
+    assert report.prediction.noise_stated
+
+
+def test_noise_beyond_the_whole_covariance_leaves_a_covariance(simulated):
+    """Both are estimates: where the noise is larger, nothing is left that readings share."""
+    truth, _, xyz = simulated
+    total = np.diag([0.02, 0.005, 0.02]) ** 2
+    positions = readings_of(truth, xyz, cov=total)
+    report = single_point_test(positions, truth, noise_cov_mm2=0.01**2 * np.eye(3))
+    expected = [0.02**2 - 0.9 * 0.01**2, 0.1 * 0.005**2, 0.02**2 - 0.9 * 0.01**2]
+    np.testing.assert_allclose(report.predicted_cov_mm2, [np.diag(expected)] * 90, atol=1e-15)
+
+
+def test_region_of_a_mean_of_ten_readings_holds_with_stated_noise():
+    """Every image point has an error that all readings share, beside noise half as large."""
+    rig, rng = rig_b(), np.random.default_rng(16)
+    truth = random_positions(400, rig.volume_mm, rng)
+    points = observe(rig.cameras, truth, noise_px=0.05, rng=rng, readings=10)
+    common = np.broadcast_to(0.1 * rng.standard_normal((2, 1, 400, 2)), (2, 10, 400, 2))
+    shape = (len(points), 2, 2)
+    points = replace(
+        points,
+        xy_px=points.xy_px + common.reshape(-1, 2),
+        cov_px2=np.broadcast_to((0.1**2 + 0.05**2) * np.eye(2), shape),
+        noise_cov_px2=np.broadcast_to(0.05**2 * np.eye(2), shape),
+    )
+    report = single_point_test(measure_points(rig.true_rig(), points), truth)
+    assert report.coverage.share == pytest.approx(0.95, abs=0.033)  # three standard errors
+    assert report.prediction.accuracy_ratio == pytest.approx(np.ones(4), abs=0.11)
+    assert report.prediction.repeatability_ratio == pytest.approx(np.ones(4), abs=0.04)
 
 
 def test_measured_readings_of_a_true_rig_are_all_noise():

@@ -49,7 +49,7 @@ def check_sections(checks: Iterable[Mapping[str, Any]]) -> list[Section]:
         writer = writers.get(str(check.get("kind")))
         if writer is not None:
             title, blocks = writer(check)
-            job = f": {check['job']}" if check.get("job") else ""
+            job = f": {check['job']}" if check.get("job") not in (None, check["kind"]) else ""
             sections.append(Section(f"check-{number}", title + job, tuple(blocks)))
     return sections
 
@@ -207,16 +207,20 @@ def _lengths(check: Mapping[str, Any]) -> tuple[str, list[Block]]:
         "correlation between the two ends is ignored, which overstates it for short lengths)."
     )
     panel = Panel(
-        x=true,
+        x=np.arange(1.0, len(true) + 1),
         y=error,
-        x_label="known length [mm]",
+        spread=2000 * numbers(rows["predicted_std_mm"]),
+        x_label="number of the length",
         y_label="error [µm]",
-        title="Error of each length",
+        title="Error of each length and two predicted standard deviations",
         colour=VERMILION,
         levels=(Level(0.0, ""),),
     )
-    caption = "Error of each length (measured minus known) against its length."
-    picture = panel_grid([panel], columns=1, height=190, title="Lengths", description=caption)
+    caption = (
+        "Error of each length (measured minus known) in the order of the table; bars reach two "
+        "predicted standard deviations up and down."
+    )
+    picture = panel_grid([panel], columns=1, height=150, title="Lengths", description=caption)
     blocks: list[Block] = [Paragraph(text), Figure(picture, caption), _length_rows(rows)]
     return "Lengths", blocks + left_out(check)
 

@@ -14,6 +14,9 @@ from closerange.geometry.arrays import FloatArray
 MAX_ROWS = 200
 """Rows of a table that a report prints; the rest is in the CSV file."""
 
+FOLD_ROWS = 40
+"""Rows above which a table is looked up rather than read: folded on a screen."""
+
 TOO_SMALL = "region too small"
 """Stated uncertainties that errors exceed by more than chance explains."""
 
@@ -57,12 +60,25 @@ def documents_of(checks: Sequence[object]) -> tuple[Mapping[str, Any], ...]:
 def shown(
     rows: Sequence[Sequence[str]], caption: str, head: tuple[str, ...], **style: Any
 ) -> Table:
-    """Make a table of at most `MAX_ROWS` rows that says so where it is cut."""
+    """Make a table of at most `MAX_ROWS` rows that says so where it is cut; a long one folds.
+
+    Columns of words that are blank in every row are left out.
+    """
     cut = len(rows) - MAX_ROWS
     if cut > 0:
         caption = f"{caption} (first {MAX_ROWS} of {len(rows)} rows; for the others see the CSV)"
         style["marked"] = frozenset(row for row in style.get("marked", ()) if row < MAX_ROWS)
-    return Table(caption, head, list(rows[:MAX_ROWS]), **style)
+    folded = len(rows) > FOLD_ROWS
+    texts = style.pop("texts", frozenset({0}))
+    kept = [i for i in range(len(head)) if i not in texts or any(row[i] for row in rows)]
+    return Table(
+        caption,
+        tuple(head[i] for i in kept),
+        [tuple(row[i] for i in kept) for row in rows[:MAX_ROWS]],
+        texts=frozenset(place for place, i in enumerate(kept) if i in texts),
+        folded=folded,
+        **style,
+    )
 
 
 def coverage_word(coverage: Mapping[str, Any]) -> str:
@@ -105,6 +121,14 @@ def coverage_text(coverage: Mapping[str, Any]) -> str:
         f"and {percent(high)}. Mean squared error / predicted variance: {fixed(ratio, 2)} (1 if "
         "the covariances hold)."
     )
+
+
+def proving_group(check: Mapping[str, Any]) -> tuple[str, str]:
+    """Prefer points that were not used for the calibration: only they prove anything."""
+    group = check["groups"].get("check")
+    if group is not None and group["count"]:
+        return "check", "check point"
+    return "all", "control point"
 
 
 def left_out(check: Mapping[str, Any]) -> list[Block]:

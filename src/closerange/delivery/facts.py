@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
+import hashlib
 import re
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
 from closerange.delivery.excerpts import shown
-from closerange.delivery.sheet import Block, Section, Table
-from closerange.delivery.wording import DASH, printed, significant
+from closerange.delivery.sheet import Block, Files, Section, Table
+from closerange.delivery.wording import DASH, counted, printed, significant
+
+FEW_FILES = 12
+"""Up to so many files are a table; more are a folded list."""
 
 _HASH = re.compile(r"[0-9a-f]{64}")
 _UNITS = {"mm": "mm", "mm2": "mm²", "px": "px", "px2": "px²", "rad": "rad", "s": "s"}
@@ -50,16 +54,12 @@ def fact_blocks(caption: str, facts: Mapping[str, Any]) -> list[Block]:
     tables: list[Block] = []
     for path, value in _walk("", facts):
         if _is_hashes(value):
-            rows = [(str(name), str(digest)) for name, digest in value.items()]
-            head = ("file", "SHA-256")
-            tables.append(
-                Table(words(path), head, rows, texts=frozenset({0, 1}), dense=True, breakable=True)
-            )
+            tables.append(_files(_title(path), value))
         elif isinstance(value, Mapping):
             rows_of = [{"name": name, **item} for name, item in value.items()]
-            tables.append(_rows_table(words(path), rows_of))
+            tables.append(_rows_table(_title(path), rows_of))
         elif _is_rows(value):
-            tables.append(_rows_table(words(path), value))
+            tables.append(_rows_table(_title(path), value))
         else:
             singles.append((words(path), _text(value)))
     if singles:
@@ -68,12 +68,46 @@ def fact_blocks(caption: str, facts: Mapping[str, Any]) -> list[Block]:
     return tables
 
 
+def combined_hash(hashes: Mapping[str, str]) -> str:
+    """Return one SHA-256 for many files.
+
+    Parameters
+    ----------
+    hashes : mapping of str to str
+        Digest by file name.
+
+    Returns
+    -------
+    str
+        SHA-256 of the list that ``sha256sum`` prints for the files in the order of their names
+        (by code point): a line for each, digest, two blanks, name.
+    """
+    lines = "".join(f"{hashes[name]}  {name}\n" for name in sorted(hashes))
+    return hashlib.sha256(lines.encode()).hexdigest()
+
+
 def words(name: str) -> str:
     """Write a field name as words: ``cross_validation_px`` is ``cross validation [px]``."""
     stem, _, unit = name.rpartition("_")
     if stem and unit in _UNITS:
         return f"{stem.replace('_', ' ')} [{_UNITS[unit]}]"
     return name.replace("_", " ")
+
+
+def _files(title: str, hashes: Mapping[str, str]) -> Block:
+    """List files with their hashes, and one hash for all of them."""
+    entries = tuple((str(name), str(hashes[name])) for name in sorted(hashes))
+    if len(entries) <= FEW_FILES:
+        texts = frozenset({0, 1})
+        return Table(title, ("file", "SHA-256"), entries, texts, breakable=True)
+    caption = f"{title}: {counted(len(entries), 'file')}, combined SHA-256 {combined_hash(hashes)}"
+    return Files(caption, entries)
+
+
+def _title(path: str) -> str:
+    """Write the path of a table as its caption."""
+    text = {"inputs": "Input files"}.get(path, words(path.removesuffix(": table")))
+    return f"{text[0].upper()}{text[1:]}"
 
 
 def _walk(path: str, value: Any) -> Iterator[tuple[str, Any]]:

@@ -25,6 +25,9 @@ from closerange.rig.rig import Residuals
 
 SCHEMA = "closerange.overlay/1"
 
+SMALL_PX = 400
+"""Crops up to this long are shown a quarter of the page wide, larger images half."""
+
 MAX_WIDTH_PX = 640
 """Width of the stored picture: 90 mm on paper at 180 dpi, which is what a page can show."""
 
@@ -77,6 +80,11 @@ class Overlay:
         object.__setattr__(self, "flags", frozen_ints(self.flags, (count,), "flags"))
         object.__setattr__(self, "point", tuple(self.point))
         object.__setattr__(self, "size_px", (int(self.size_px[0]), int(self.size_px[1])))
+
+    @property
+    def small(self) -> bool:
+        """Whether it is a crop that needs little room."""
+        return max(self.size_px) <= SMALL_PX
 
     @property
     def file_name(self) -> str:
@@ -206,7 +214,7 @@ def make_overlay(
 
 
 def draw_overlay(overlay: Overlay, *, factor: float = 1.0) -> Markup:
-    """Draw an overlay half a page wide.
+    """Draw an overlay half a page wide; a small one a quarter.
 
     Parameters
     ----------
@@ -221,11 +229,12 @@ def draw_overlay(overlay: Overlay, *, factor: float = 1.0) -> Markup:
         Inline SVG: the picture, ellipses or crosses, names, and residual vectors.
     """
     width, height = overlay.size_px
-    scale = (FULL_WIDTH / 2) / width
+    paper = FULL_WIDTH / (4 if overlay.small else 2)
+    scale = paper / width
     found = np.asarray(np.isfinite(overlay.xy_px).all(axis=1))
     flagged = int((overlay.flags != 0).sum())
     drawing = Drawing(
-        FULL_WIDTH / 2,
+        paper,
         height * scale,
         f"Camera {overlay.camera}{overlay.placement and ', placement ' + overlay.placement}",
         f"{int(found.sum())} of {len(found)} points found, {flagged} flagged",
@@ -234,7 +243,7 @@ def draw_overlay(overlay: Overlay, *, factor: float = 1.0) -> Markup:
         "image",
         x=0,
         y=0,
-        width=FULL_WIDTH / 2,
+        width=paper,
         height=height * scale,
         preserveAspectRatio="none",
         href=f"data:image/jpeg;base64,{overlay.picture}",
@@ -267,7 +276,9 @@ def common_factor(overlays: Sequence[Overlay]) -> float:
         A round number; one for all, so that pictures can be compared.
     """
     lengths = [np.linalg.norm(overlay.residual_px, axis=1) for overlay in overlays]
-    return magnification(np.concatenate(lengths), overlays[0].size_px)
+    most = max(overlays, key=lambda overlay: int(np.isfinite(overlay.residual_px).sum()))
+    count = int(np.isfinite(most.residual_px).all(axis=1).sum())
+    return magnification(np.concatenate(lengths), most.size_px, count=count)
 
 
 def _draw_mark(drawing: Drawing, at: tuple[float, float], ellipse: FloatArray, colour: str) -> None:
@@ -308,7 +319,7 @@ def _draw_name(
     name = overlay.point[row]
     if overlay.flags[row]:
         name = f"{name}: {format_flags(int(overlay.flags[row]))}"
-    right = at[0] > drawing.width - 60
+    right = at[0] > 0.8 * drawing.width
     drawing.text(
         (at[0] - away if right else at[0] + away, at[1] - away),
         name,

@@ -74,6 +74,8 @@ class Panel:
         ``dot``, ``stem`` (a line from zero) or ``chain`` (dots joined).
     zero : bool
         Whether the y axis must include zero.
+    spread : ndarray, shape (N,), or None
+        Half lengths of bars about the marks; NaN draws none.
     """
 
     x: FloatArray
@@ -86,6 +88,7 @@ class Panel:
     trend: tuple[float, float] | None = None
     mark: str = "dot"
     zero: bool = False
+    spread: FloatArray | None = None
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "x", frozen_array(self.x, (None,), "x"))
@@ -173,7 +176,9 @@ def axis_panels(
     ]
 
 
-def magnification(length_px: ArrayLike, size_px: tuple[int, int]) -> float:
+def magnification(
+    length_px: ArrayLike, size_px: tuple[int, int], *, count: int | None = None
+) -> float:
     """Choose a round factor that makes vectors visible without covering each other.
 
     Parameters
@@ -182,18 +187,23 @@ def magnification(length_px: ArrayLike, size_px: tuple[int, int]) -> float:
         Lengths of the vectors; NaN is left out.
     size_px : tuple of int
         Image that they are drawn on.
+    count : int, optional
+        Vectors in one image, if `length_px` holds those of several.
 
     Returns
     -------
     float
-        1, 2 or 5 times a power of ten: the 90th percentile becomes at most 5 % of the width.
+        A round number: the 90th percentile becomes at most half the distance between evenly
+        spread points, and at most a tenth of the width.
     """
     lengths = np.asarray(length_px, np.float64)
     lengths = lengths[np.isfinite(lengths) & (lengths > 0)]
     if not lengths.size:
         return 1.0
+    apart = math.sqrt(size_px[0] * size_px[1] / max(count or lengths.size, 1))
+    reach = min(0.5 * apart, 0.1 * size_px[0])
     # a few blunders must not shrink all the others to dots, hence a percentile
-    return _round_below(0.05 * size_px[0] / float(np.quantile(lengths, 0.9)))
+    return _round_below(reach / float(np.quantile(lengths, 0.9)), steps=(1, 1.5, 2, 3, 4, 5, 7))
 
 
 def vector_plot(
@@ -264,10 +274,10 @@ def _vector_key(drawing: Drawing, y: float, units_per_px: float, odd: bool) -> N
         drawing.text((_LEFT + 178, y), "not fitted (dashed)", fill=VERMILION)
 
 
-def _round_below(limit: float) -> float:
-    """Return the largest 1, 2 or 5 times a power of ten that does not exceed a limit."""
+def _round_below(limit: float, *, steps: Sequence[float] = (1, 2, 5)) -> float:
+    """Return the largest round number (steps times a power of ten) not above a limit."""
     power = 10.0 ** math.floor(math.log10(limit))
-    return max(m * power for m in (1.0, 2.0, 5.0) if m * power <= limit * (1 + 1e-9))
+    return max(m * power for m in steps if m * power <= limit * (1 + 1e-9))
 
 
 def _clipped(foot: Point, vector: Point, frame: tuple[float, float, float, float]) -> Point:
@@ -284,12 +294,14 @@ def _draw_panel(drawing: Drawing, panel: Panel, corner: Point, size: Point) -> N
     """Draw one panel into its place."""
     known = np.isfinite(panel.x) & np.isfinite(panel.y)
     x, y = panel.x[known], panel.y[known]
-    span_y = [*y, *(level.value for level in panel.levels)]
+    half = np.nan_to_num(panel.spread[known]) if panel.spread is not None else 0 * y
+    span_y = [*(y - half), *(y + half), *(level.value for level in panel.levels)]
     left, top = corner[0] + _LEFT, corner[1] + _TOP
     right, bottom = corner[0] + size[0] - _RIGHT, corner[1] + size[1] - _BOTTOM
     x_scale = Scale(*widened(list(x), margin=0.03), left, right)
     y_scale = Scale(*widened(span_y, zero=panel.zero), bottom, top)
-    _axes(drawing, x_scale, y_scale, (panel.x_label, panel.y_label))
+    counted = bool((x == np.round(x)).all())
+    _axes(drawing, x_scale, y_scale, (panel.x_label, panel.y_label), counted=counted)
     drawing.text((left, top - 7), panel.title, font_weight="bold")
     _draw_levels(drawing, panel, x_scale, y_scale)
     if panel.trend is not None and len(x):
@@ -303,6 +315,9 @@ def _draw_panel(drawing: Drawing, panel: Panel, corner: Point, size: Point) -> N
         foot = units(y_scale(0.0))
         steps = " ".join(f"M{units(px)} {foot}V{units(py)}" for px, py in places)
         drawing.add("path", d=steps or "M0 0", stroke=panel.colour, stroke_width=0.8, fill="none")
+    for (px, _), low, high in zip(places, y - half, y + half, strict=True):
+        if high > low:
+            drawing.line((px, y_scale(low)), (px, y_scale(high)), panel.colour, stroke_width=1.1)
     for place in places:
         drawing.dot(place, 1.7, panel.colour)
     _name_levels(drawing, panel, x_scale, y_scale)
@@ -343,11 +358,20 @@ def _name_levels(drawing: Drawing, panel: Panel, x_scale: Scale, y_scale: Scale)
             )
 
 
-def _axes(drawing: Drawing, x_scale: Scale, y_scale: Scale, labels: tuple[str, str]) -> None:
-    """Draw frame, grid, ticks and labels."""
+def _axes(
+    drawing: Drawing,
+    x_scale: Scale,
+    y_scale: Scale,
+    labels: tuple[str, str],
+    *,
+    counted: bool = False,
+) -> None:
+    """Draw frame, grid, ticks and labels; what is counted has no ticks between whole numbers."""
     left, right = x_scale.start, x_scale.end
     top, bottom = sorted((y_scale.start, y_scale.end))
     x_count = max(2, int((right - left) / 42))
+    if counted:
+        x_count = max(1, min(x_count, math.ceil(x_scale.high - x_scale.low)))
     x_ticks, x_step = _ticks(x_scale, x_count)
     y_ticks, y_step = _ticks(y_scale, max(4, int((bottom - top) / 20)))
     for value in x_ticks:

@@ -8,22 +8,23 @@ from typing import Any
 from jinja2 import Environment, PackageLoader, StrictUndefined
 from markupsafe import Markup, escape
 
+from closerange.delivery.answers import answers
 from closerange.delivery.calibration_section import calibration_section
 from closerange.delivery.check_sections import check_sections
 from closerange.delivery.excerpts import documents_of
 from closerange.delivery.facts import provenance_section
-from closerange.delivery.front_page import figures_table, front_picture, verdict
+from closerange.delivery.figures_table import figures_table
+from closerange.delivery.front_page import front_picture, verdict
 from closerange.delivery.glossary import glossary_section, words_in
 from closerange.delivery.overlays import Overlay
 from closerange.delivery.report_sections import (
     flags_section,
     measured_section,
     pictures_section,
-    points_section,
-    positions_section,
     prediction_section,
 )
-from closerange.delivery.sheet import Contents, Paragraph, Section, Table, Terms
+from closerange.delivery.sheet import Contents, Files, Paragraph, Section, Table, Terms
+from closerange.delivery.table_sections import points_section, positions_section
 from closerange.delivery.wording import printed
 from closerange.features.image_points import ImagePoints
 from closerange.position.positions import Positions
@@ -36,9 +37,9 @@ def render_report(  # noqa: PLR0913 - each argument is one thing that a report m
     *,
     title: str,
     rig: Rig | None = None,
-    points: ImagePoints | None = None,
+    points: ImagePoints | Mapping[str, ImagePoints] | None = None,
     overlays: Sequence[Overlay] = (),
-    positions: Positions | None = None,
+    positions: Positions | Mapping[str, Positions] | None = None,
     checks: Sequence[object] = (),
     error_map: ErrorMap | None = None,
     provenance: Mapping[str, Any] | None = None,
@@ -53,12 +54,12 @@ def render_report(  # noqa: PLR0913 - each argument is one thing that a report m
         Name of the job.
     rig : Rig, optional
         Calibrated cameras.
-    points : ImagePoints, optional
-        Detected points.
+    points : ImagePoints or mapping of str to ImagePoints, optional
+        Detected points; those of several jobs by the name of the job.
     overlays : sequence of Overlay, optional
         Pictures with what was found on them; about 100 kB each.
-    positions : Positions, optional
-        Measured positions.
+    positions : Positions or mapping of str to Positions, optional
+        Measured positions, likewise.
     checks : sequence of object, optional
         Verification results (`ControlCheck`, `AcceptanceReport`, `LengthCheck`) or their stored
         documents.
@@ -80,9 +81,9 @@ def render_report(  # noqa: PLR0913 - each argument is one thing that a report m
     contents = Contents(
         title=title,
         rig=rig,
-        points=points,
+        points={"": points} if isinstance(points, ImagePoints) else points or {},
         overlays=tuple(overlays),
-        positions=positions,
+        positions={"": positions} if isinstance(positions, Positions) else positions or {},
         checks=documents_of(checks),
         error_map=error_map,
         provenance=provenance or {},
@@ -111,6 +112,7 @@ def _render(contents: Contents) -> str:
     return environment.get_template("report.html.j2").render(
         contents=contents,
         verdict=verdict(contents),
+        answers=answers(contents),
         picture=front_picture(contents),
         figures=front_table,
         sections=sections,
@@ -153,6 +155,8 @@ def _spoken(sections: Sequence[Section], table: Table | None) -> list[str]:
             texts += [block.caption, *block.head, *(row[0] for row in block.rows if row)]
         elif isinstance(block, Terms):
             texts += [f"{word} {meaning}" for word, meaning in block.entries]
+        elif isinstance(block, Files):
+            texts.append(block.caption)
         else:
             texts.append(block.text if isinstance(block, Paragraph) else block.caption)
     return texts

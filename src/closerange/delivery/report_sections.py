@@ -1,24 +1,20 @@
-"""Sections on the measurement: how it was done, calibration, pictures, points, positions."""
+"""Sections on the measurement: how it was done, what error is predicted, pictures, flags."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator
-from itertools import groupby
 
 import numpy as np
 
-from closerange.delivery.excerpts import shown
 from closerange.delivery.overlays import common_factor, draw_overlay
-from closerange.delivery.plots import axis_panels, panel_grid
 from closerange.delivery.sheet import Block, Contents, Figure, Paragraph, Section, Table
 from closerange.delivery.volume_plots import draw_slices
 from closerange.delivery.wording import (
     FLAG_WORDS,
+    TIMES,
     counted,
     fixed,
-    flag_names,
     micrometres,
-    mm,
     significant,
 )
 from closerange.features.image_points import ImagePoints
@@ -26,9 +22,6 @@ from closerange.flags import Flag
 from closerange.geometry.arrays import FloatArray
 from closerange.position.positions import Positions
 from closerange.rig.rig import Rig
-
-MIN_READINGS = 20
-"""Readings at one position from which on their sequence is worth a figure."""
 
 
 def measured_section(contents: Contents) -> Section | None:
@@ -47,20 +40,10 @@ def measured_section(contents: Contents) -> Section | None:
     blocks: list[Block] = []
     if contents.rig is not None:
         blocks += [Paragraph(_rig_sentence(contents.rig)), _cameras_table(contents.rig)]
-    sentences = []
-    if contents.points is not None:
-        points = contents.points
-        sentences.append(
-            f"{int(points.found.sum())} of {counted(len(points), 'image point')} were found by "
-            f"{counted(len(points.cameras), 'camera')} in "
-            f"{counted(len(set(points.placement)), 'placement')}."
-        )
-    if contents.positions is not None:
-        positions = contents.positions
-        sentences.append(
-            f"{int(positions.measured.sum())} of {counted(len(positions), 'position')} were "
-            f"measured in {counted(len(set(positions.placement)), 'placement')}."
-        )
+    jobs = dict.fromkeys((*contents.points, *contents.positions))
+    sentences = [
+        _job_sentence(job, contents.points.get(job), contents.positions.get(job)) for job in jobs
+    ]
     if sentences:
         blocks.append(Paragraph(" ".join(sentences)))
     return Section("measured", "How it was measured", tuple(blocks)) if blocks else None
@@ -107,7 +90,8 @@ def pictures_section(contents: Contents) -> Section | None:
     if not contents.overlays:
         return None
     text = (
-        "Every image with the points found on it: ellipses are the fitted outlines of discs, "
+        "Images with the points found on them, the first ones of each job: ellipses are the "
+        "fitted outlines of discs, "
         "crosses their centres (cyan: good; orange: flagged, with the flag's name). Yellow arrows "
         "are residuals of the calibration, observed minus calculated, magnified as stated."
     )
@@ -123,70 +107,26 @@ def pictures_section(contents: Contents) -> Section | None:
             words.append(f"residuals magnified {significant(factor)} times")
         width, height = overlay.size_px
         source = f" ({overlay.file_name})" if overlay.file_name else ""
-        caption = f"{', '.join(words)}; image {width} x {height} px{source}."
-        blocks.append(Figure(draw_overlay(overlay, factor=factor), caption, half=True))
+        caption = f"{', '.join(words)}; image {width} {TIMES} {height} px{source}."
+        picture = draw_overlay(overlay, factor=factor)
+        small = overlay.small
+        blocks.append(Figure(picture, caption, half=not small, quarter=small))
     return Section("pictures", "Pictures with detected points", tuple(blocks))
-
-
-def points_section(contents: Contents) -> Section | None:
-    """Count points, camera by camera."""
-    points = contents.points
-    if points is None or not len(points):
-        return None
-    rows = [_points_row(points.of_camera(camera), camera) for camera in points.cameras]
-    head = (
-        *("camera", "placements", "points", "found", "flagged"),
-        *("median std x [px]", "median std y [px]"),
-    )
-    blocks: list[Block] = [Table("Image points of each camera", head, rows)]
-    bad = points.select(points.flags != 0)
-    cells = [
-        (
-            *(bad.camera[i], bad.placement[i], bad.point[i]),
-            *(fixed(float(value), 2) for value in bad.xy_px[i]),
-            ", ".join(flag_names(int(bad.flags[i]))),
-        )
-        for i in range(len(bad))
-    ]
-    if cells:
-        names = ("camera", "placement", "point", "x [px]", "y [px]", "flags")
-        blocks.append(shown(cells, "Flagged points", names, texts=frozenset({0, 1, 2, 5})))
-    return Section("points", "Image points", tuple(blocks))
-
-
-def positions_section(contents: Contents) -> Section | None:
-    """Show measured positions and, if there are enough, readings at one position."""
-    positions = contents.positions
-    if positions is None or not len(positions):
-        return None
-    std = np.sqrt(np.einsum("mii->mi", positions.cov_mm2))
-    good = positions.measured & (positions.flags == 0)
-    residual = positions.residual_px[np.isfinite(positions.residual_px)]
-    rows = [
-        ("positions", str(len(positions)), ""),
-        ("measured", str(int(positions.measured.sum())), ""),
-        ("without a flag", str(int(good.sum())), ""),
-        ("residual (rms)", fixed(_rms(residual), 3), "px"),
-        *(
-            (f"predicted standard deviation of {name} (median)", _median_um(std[:, axis]), "µm")
-            for axis, name in enumerate("XYZ")
-        ),
-    ]
-    blocks: list[Block] = [Table("Positions", ("figure", "value", "unit"), rows, frozenset({0, 2}))]
-    blocks += _readings(positions)
-    blocks.append(_positions_table(positions, std))
-    return Section("positions", "Positions", tuple(blocks))
 
 
 def flags_section(contents: Contents) -> Section | None:
     """Explain in words every flag that occurs."""
     rig = contents.rig
-    columns = [
-        ("image points", None if contents.points is None else contents.points.flags),
-        ("calibration points", None if rig is None else rig.residuals.flags),
-        ("positions", None if contents.positions is None else contents.positions.flags),
+    columns = {
+        "image points": [points.flags for points in contents.points.values()],
+        "calibration points": [] if rig is None else [rig.residuals.flags],
+        "positions": [positions.flags for positions in contents.positions.values()],
+    }
+    present = [
+        (name, np.concatenate(flags))
+        for name, flags in columns.items()
+        if sum(len(each) for each in flags)
     ]
-    present = [(name, flags) for name, flags in columns if flags is not None and len(flags)]
     checked = [name for cell in _document_flags(contents) for name in cell.split("|")]
     rows = []
     for bit in Flag:
@@ -212,8 +152,25 @@ def _document_flags(contents: Contents) -> Iterator[str]:
             yield row[-1]
 
 
+def _job_sentence(job: str, points: ImagePoints | None, positions: Positions | None) -> str:
+    """Count what one job found and measured."""
+    parts = []
+    if points is not None:
+        parts.append(
+            f"{int(points.found.sum())} of {counted(len(points), 'image point')} found by "
+            f"{counted(len(points.cameras), 'camera')} in "
+            f"{counted(len(set(points.placement)), 'placement')}"
+        )
+    if positions is not None:
+        parts.append(
+            f"{int(positions.measured.sum())} of {counted(len(positions), 'position')} measured in "
+            f"{counted(len(set(positions.placement)), 'placement')}"
+        )
+    return f"{f'Job {job}: ' if job else ''}{', '.join(parts)}."
+
+
 def _rig_sentence(rig: Rig) -> str:
-    size = " x ".join(fixed(float(side), 0) for side in rig.volume_mm[1] - rig.volume_mm[0])
+    size = f" {TIMES} ".join(fixed(float(side), 0) for side in rig.volume_mm[1] - rig.volume_mm[0])
     residuals = rig.residuals
     fitted = int(np.asarray(residuals.fitted).sum())
     placements = counted(len(set(residuals.placement)), "placement")
@@ -234,7 +191,7 @@ def _cameras_table(rig: Rig) -> Table:
         rows.append(
             (
                 camera.name,
-                f"{camera.size_px[0]} x {camera.size_px[1]}",
+                f"{camera.size_px[0]} {TIMES} {camera.size_px[1]}",
                 fixed(float(np.linalg.norm(camera.centre_mm - middle)), 0),
                 fixed(depth / float(camera.matrix_px[0, 0]), 3),
                 fixed(float(angle), 1) if i else "reference",
@@ -256,83 +213,5 @@ def _direction(rig: Rig, index: int, middle_mm: FloatArray) -> FloatArray:
     return away / np.linalg.norm(away)
 
 
-def _points_row(points: ImagePoints, camera: str) -> tuple[str, ...]:
-    std = np.sqrt(np.einsum("nii->ni", points.cov_px2))
-    return (
-        camera,
-        str(len(set(points.placement))),
-        str(len(points)),
-        str(int(points.found.sum())),
-        str(int((points.flags != 0).sum())),
-        *(fixed(_median(std[:, axis]), 4) for axis in (0, 1)),
-    )
-
-
-def _readings(positions: Positions) -> list[Block]:
-    """Draw the readings at the position that has the most (figure 3.2: 100 readings)."""
-    keys = list(zip(positions.placement, positions.point, strict=True))
-    known = [key for key, is_known in zip(keys, positions.measured, strict=True) if is_known]
-    counts = {key: len(list(group)) for key, group in groupby(sorted(known))}
-    if not counts or max(counts.values()) < MIN_READINGS:
-        return []
-    key = max(counts, key=lambda name: counts[name])
-    rows = [i for i, other in enumerate(keys) if other == key and positions.measured[i]]
-    xyz = positions.xyz_mm[rows]
-    mean, std = xyz.mean(axis=0), xyz.std(axis=0, ddof=1)
-    panels = axis_panels(
-        1000 * (xyz - mean),
-        unit="µm",
-        quantity="reading minus mean",
-        x_label="number of the reading",
-        mark="chain",
-    )
-    name = ", ".join(filter(None, (key[0] and f"placement {key[0]}", f"point {key[1]}")))
-    caption = (
-        f"{len(rows)} readings at one position ({name}); mean X {mm(mean[0])} Y {mm(mean[1])} "
-        f"Z {mm(mean[2])} mm; standard deviation X {micrometres(std[0])} Y {micrometres(std[1])} "
-        f"Z {micrometres(std[2])} µm."
-    )
-    title = "Readings at one position"
-    picture = panel_grid(panels, columns=1, height=108, title=title, description=caption)
-    return [Figure(picture, caption)]
-
-
-def _positions_table(positions: Positions, std_mm: FloatArray) -> Table:
-    several = any(positions.reading)
-    cells = [
-        (
-            positions.placement[i],
-            *((positions.reading[i],) if several else ()),
-            positions.point[i],
-            *map(mm, positions.xyz_mm[i]),
-            *(micrometres(float(value)) for value in std_mm[i]),
-            fixed(float(positions.residual_px[i]), 3),
-            str(int(positions.cameras[i])),
-            ", ".join(flag_names(int(positions.flags[i]))),
-        )
-        for i in range(len(positions))
-    ]
-    names = ("placement", *(("reading",) if several else ()), "point")
-    head = (
-        *names,
-        *(f"{axis} [mm]" for axis in "XYZ"),
-        *(f"std {axis} [µm]" for axis in "XYZ"),
-        *("residual [px]", "cameras", "flags"),
-    )
-    texts = frozenset({*range(len(names)), len(head) - 1})
-    marked = frozenset(i for i, flag in enumerate(positions.flags) if flag)
-    caption = "Measured positions with their predicted standard deviation"
-    return shown(cells, caption, head, texts=texts, marked=marked, wide=True)
-
-
 def _rms(values: FloatArray) -> float:
     return float(np.sqrt(np.mean(values**2))) if values.size else float("nan")
-
-
-def _median(values: FloatArray) -> float:
-    known = values[np.isfinite(values)]
-    return float(np.median(known)) if known.size else float("nan")
-
-
-def _median_um(values_mm: FloatArray) -> str:
-    return micrometres(_median(values_mm))

@@ -25,12 +25,12 @@ class Contents:
         Name of the job.
     rig : Rig or None
         Calibrated cameras.
-    points : ImagePoints or None
-        Detected points.
+    points : mapping of str to ImagePoints
+        Detected points by the name of their job; a name may be empty.
     overlays : sequence of Overlay
         Pictures with the points drawn on them.
-    positions : Positions or None
-        Measured positions.
+    positions : mapping of str to Positions
+        Measured positions by the name of their job.
     checks : tuple of mapping
         Documents of verification results, each with its ``kind``.
     error_map : ErrorMap or None
@@ -45,9 +45,9 @@ class Contents:
 
     title: str
     rig: Rig | None = None
-    points: ImagePoints | None = None
+    points: Mapping[str, ImagePoints] = field(default_factory=dict)
     overlays: Sequence[Overlay] = ()
-    positions: Positions | None = None
+    positions: Mapping[str, Positions] = field(default_factory=dict)
     checks: tuple[Mapping[str, Any], ...] = ()
     error_map: ErrorMap | None = None
     provenance: Mapping[str, Any] = field(default_factory=dict)
@@ -94,10 +94,12 @@ class Table:
         Rows to be marked as defective; the row's words say why.
     wide : bool
         Small print, for tables of many columns.
-    dense : bool
-        Smallest print, for long lists that are looked up, not read.
     breakable : bool
         Cells of long texts without blanks, such as paths, may be broken anywhere.
+    folded : bool
+        Shown on a screen only when asked for.
+    printed : bool
+        Whether paper shows it too; a long table that repeats a file beside the report need not.
     """
 
     caption: str
@@ -107,13 +109,20 @@ class Table:
     marked: frozenset[int] = frozenset()
     wide: bool = False
     breakable: bool = False
-    dense: bool = False
+    folded: bool = False
+    printed: bool = True
     kind: str = "table"
 
     @property
     def style(self) -> str:
         """Return the classes of the style sheet."""
-        return " ".join(name for name in ("wide", "breakable", "dense") if getattr(self, name))
+        return " ".join(name for name in ("wide", "breakable") if getattr(self, name))
+
+    @property
+    def summary(self) -> str:
+        """Return what stands for the table while it is folded."""
+        rows = "" if "rows" in self.caption else f": {len(self.rows)} rows"
+        return f"{self.caption}{rows}{'' if self.printed else '; not printed'}"
 
 
 @dataclass(frozen=True, slots=True)
@@ -126,14 +135,32 @@ class Figure:
         Inline SVG.
     caption : str
         What one sees, with units and scale.
-    half : bool
-        Half as wide as the page: two stand side by side.
+    half, quarter : bool
+        Half or a quarter as wide as the page: two or four stand side by side.
     """
 
     picture: Markup
     caption: str
     half: bool = False
+    quarter: bool = False
     kind: str = "figure"
+
+
+@dataclass(frozen=True, slots=True)
+class Files:
+    """A long list of files with their SHA-256: folded on a screen, in small print on paper.
+
+    Attributes
+    ----------
+    caption : str
+        What they are, how many, and one hash for all of them.
+    entries : tuple of (str, str)
+        Name and digest.
+    """
+
+    caption: str
+    entries: tuple[tuple[str, str], ...]
+    kind: str = "files"
 
 
 @dataclass(frozen=True, slots=True)
@@ -146,14 +173,17 @@ class Terms:
         Word and explanation.
     anchor : str
         If set, each word can be linked to as ``#<anchor>-<word>``.
+    style : str
+        A class of the style sheet.
     """
 
     entries: tuple[tuple[str, str], ...]
     anchor: str = ""
+    style: str = ""
     kind: str = "terms"
 
 
-Block: TypeAlias = Paragraph | Table | Figure | Terms
+Block: TypeAlias = Paragraph | Table | Figure | Files | Terms
 
 
 @dataclass(frozen=True, slots=True)

@@ -220,14 +220,14 @@ def _expected_and_found(check: Mapping[str, Any]) -> Terms:
         f"By chance alone the worst of so many errors is {_luck(luck['worst_error'])} standard "
         f"deviations, and half the width of the envelope {half_range}."
     )
-    note = (
-        ""
+    source = (
+        "predicted from image noise"
         if prediction["noise_stated"]
-        else (" (that prediction includes the calibration's part: below 1 is right)")
+        else "predicted for all errors of a reading together, hence below 1"
     )
     predicted = (
-        f"rms error {_ratios(prediction['accuracy_ratio'])}; "
-        f"repeatability {_ratios(prediction['repeatability_ratio'])}{note}."
+        f"rms error of the means {_ratios(prediction['accuracy_ratio'])}; "
+        f"repeatability {_ratios(prediction['repeatability_ratio'])}, {source}."
     )
     entries = (
         ("Worst standard deviation", worst_std),

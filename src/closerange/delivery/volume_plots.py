@@ -66,7 +66,9 @@ def draw_volume(error_map: ErrorMap) -> Markup:
                 )
         drawing.path(flat.outline(), closed=True, stroke=SOFT, stroke_width=0.8)
         z = f"Z = {_coordinate(nodes[0, 0, level, 2])} mm"
-        drawing.text((18, flat.middle + 4), z, font_weight="bold", fill=AXIS_COLOURS[2])
+        beside = (flat.at(x_edges[0], float(y_edges.mean()))[0] - 12, flat.middle + 4)
+        style: dict[str, str | float] = {"font_weight": "bold", "text_anchor": "end"}
+        drawing.text(beside, z, fill=AXIS_COLOURS[2], **style)
         if row == len(picked) - 1:
             _shelf_axes(drawing, flat, x_edges, y_edges)
     label = "predicted error in space (one standard deviation) [µm]"

@@ -11,6 +11,9 @@ from closerange.flags import Flag
 DASH = "\u2013"
 """Stands for a value that does not exist; the row's flags say why."""
 
+TIMES = "\u00d7"
+"""Between the sides of something."""
+
 FLAG_WORDS: dict[Flag, str] = {
     Flag.not_found: "expected, but not found in the image",
     Flag.at_border: "cut by the image border or too near to it",
@@ -30,6 +33,9 @@ FLAG_WORDS: dict[Flag, str] = {
     Flag.untrusted: "measured with a calibration that was accepted although untrustworthy",
     Flag.not_converged: "the computation stopped before it settled",
     Flag.frozen: "repeated readings without any variance: was the image really renewed?",
+    Flag.outside_image: "it, or all of its epipolar segment, lies outside of the image",
+    Flag.no_edge: "no edge where one was needed",
+    Flag.inconsistent: "the match, matched back, does not return to it",
 }
 
 _MICROMETRES = re.compile(r"(?<=\d )um\b")

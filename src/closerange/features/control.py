@@ -9,9 +9,9 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from closerange.errors import TableError
+from closerange.errors import InputError, TableError
 from closerange.features.image_points import ImagePoints
-from closerange.files import CsvTable, float_text, read_csv, text_cell, write_csv
+from closerange.files import check_unique, float_text, read_csv, text_cell, write_csv
 from closerange.geometry.arrays import FloatArray, IntArray, frozen_array
 
 REQUIRED = ("point", "x_mm", "y_mm", "z_mm")
@@ -33,6 +33,11 @@ class ControlPoints:
         Standard deviation of each coordinate in mm; 0 = exact.
     check : ndarray of bool, shape (N,)
         Points that are kept out of the calibration and used to check it (``role = check``).
+
+    Raises
+    ------
+    InputError
+        If a position is not finite, or a standard deviation is none.
     """
 
     placement: tuple[str, ...]
@@ -50,6 +55,25 @@ class ControlPoints:
             raise ValueError("placement, point, xyz_mm, std_mm and check differ in length")
         check.flags.writeable = False
         object.__setattr__(self, "check", check)
+        self._require_numbers()
+
+    def _require_numbers(self) -> None:
+        """Refuse positions that are not known, and what is no standard deviation."""
+        for row in np.flatnonzero(~np.isfinite(self.xyz_mm).all(axis=1)):
+            x, y, z = self.xyz_mm[row]
+            raise InputError(
+                f"control {self._name(int(row))}: its position ({x:g}, {y:g}, {z:g}) mm is not known",
+                remedy="leave the point out, or give three finite numbers",
+            )
+        for row in np.flatnonzero(~((self.std_mm >= 0) & np.isfinite(self.std_mm))):
+            raise InputError(
+                f"control {self._name(int(row))}: {self.std_mm[row]:g} mm is no standard deviation",
+                remedy="give a finite number that is not negative; 0 for exact points",
+            )
+
+    def _name(self, row: int) -> str:
+        placement = f" of placement {self.placement[row]!r}" if self.placement[row] else ""
+        return f"point {self.point[row]!r}{placement}"
 
     @classmethod
     def of(
@@ -142,7 +166,7 @@ def read_control(path: Path | str) -> ControlPoints:
     """
     table = read_csv(path, required=REQUIRED, optional=OPTIONAL)
     point = [text_cell(t, table.where(i, "point")) for i, t in enumerate(table.texts("point"))]
-    _check_unique(table)
+    check_unique(table, ("point", "placement"), remedy="remove one of the two rows")
     std = table.floats("std_mm", blank=0.0)
     for row, value in enumerate(std):
         if value < 0:
@@ -196,15 +220,3 @@ def write_control(control: ControlPoints, path: Path | str) -> None:
             for i in range(len(control))
         ),
     )
-
-
-def _check_unique(table: CsvTable) -> None:
-    seen: dict[tuple[str, str], int] = {}
-    for row, key in enumerate(zip(table.texts("placement"), table.texts("point"), strict=True)):
-        if key in seen:
-            raise TableError(
-                f"{table.where(row, 'point')}: point {key[1]!r}, placement {key[0]!r} is also in "
-                f"row {table.line[seen[key]]}",
-                remedy="remove one of the two rows",
-            )
-        seen[key] = row

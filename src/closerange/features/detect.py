@@ -96,6 +96,7 @@ def detect_target(
         ellipse=points.ellipse,
         disc_diameter_mm=target.diameters_mm,
         size_px={frame.camera: frame.size_px},
+        noise_cov_px2=points.noise_cov_px2,
     )
 
 
@@ -121,13 +122,15 @@ def _discs(frame: Frame, target: Target, grid: DiscGrid, estimator: str) -> Imag
     seen = index >= 0
     rows = index[seen]
     xy, ellipse = np.full((len(target), 2), np.nan), np.full((len(target), 3), np.nan)
-    cov = np.full((len(target), 2, 2), np.nan)
+    cov, noise = np.full((2, len(target), 2, 2), np.nan)
     flags = np.where(seen, 0, int(Flag.not_found))
-    xy[seen], ellipse[seen], cov[seen] = found.xy_px[rows], found.ellipse[rows], found.cov_px2[rows]
+    xy[seen], ellipse[seen] = found.xy_px[rows], found.ellipse[rows]
+    cov[seen], noise[seen] = found.cov_px2[rows], found.noise_cov_px2[rows]
     flags[seen] |= found.flags[rows]
     # a cut disc helps to name the others, but its own centre is biased
     cut = (flags & Flag.at_border) != 0
-    xy[cut], ellipse[cut], cov[cut] = np.nan, np.nan, np.nan
+    for array in (xy, ellipse, cov, noise):
+        array[cut] = np.nan
     return ImagePoints.of(
         camera=frame.camera,
         point=target.point,
@@ -135,6 +138,7 @@ def _discs(frame: Frame, target: Target, grid: DiscGrid, estimator: str) -> Imag
         cov_px2=cov,
         flags=flags,
         ellipse=ellipse,
+        noise_cov_px2=noise,
     )
 
 

@@ -17,7 +17,7 @@ from closerange.features.disc_model import (
     has_flat_middle,
     start_vector,
 )
-from closerange.features.disc_quality import centre_covariance, noise_and_misfit
+from closerange.features.disc_quality import centre_covariance, noise_and_misfit, noise_covariance
 from closerange.geometry.arrays import BoolArray, FloatArray
 from closerange.geometry.ellipse import Ellipse, axes_of_shape
 from closerange.geometry.least_squares import LeastSquaresFit, levenberg_marquardt
@@ -39,6 +39,8 @@ class DiscFit:
         Centre of the image ellipse.
     cov_px2 : ndarray, shape (2, 2)
         Its covariance, scaled by the fit's own residuals.
+    noise_cov_px2 : ndarray, shape (2, 2)
+        The part of it that pixel noise alone makes: the scatter between images of a still scene.
     ellipse : tuple of float
         Semi-axes a >= b in px, angle of the major axis from +x towards +y in rad.
     blur_px : float
@@ -57,6 +59,7 @@ class DiscFit:
 
     xy_px: FloatArray
     cov_px2: FloatArray
+    noise_cov_px2: FloatArray
     ellipse: tuple[float, float, float]
     blur_px: float
     contrast: float
@@ -140,6 +143,7 @@ def _result(fit: LeastSquaresFit, band: Band, origin: FloatArray, *, settled: bo
     return DiscFit(
         xy_px=origin + fit.x[:2],
         cov_px2=centre_covariance(fit, band),
+        noise_cov_px2=noise_covariance(fit, band),
         ellipse=axes_of_shape(*fit.x[2:5]),
         blur_px=blur_px(fit.x),
         contrast=float(fit.x[CONTRAST]),
@@ -149,8 +153,8 @@ def _result(fit: LeastSquaresFit, band: Band, origin: FloatArray, *, settled: bo
     )
 
 
-_NAN2 = np.full(2, np.nan)
+_NAN2 = np.full((2, 2), np.nan)
 NOT_MEASURED = DiscFit(
-    _NAN2, np.full((2, 2), np.nan), (np.nan,) * 3, np.nan, np.nan, np.nan, np.nan, converged=False
+    _NAN2[0], _NAN2, _NAN2, (np.nan,) * 3, np.nan, np.nan, np.nan, np.nan, converged=False
 )
 """The answer where there is nothing to fit."""

@@ -1,12 +1,18 @@
-"""What a fitted disc may claim: covariance of its centre, noise, and whether the model holds."""
+"""What a fitted disc may claim: covariances of its centre, noise, and whether the model holds."""
 
 from __future__ import annotations
 
 import numpy as np
 
-from closerange.features.disc_band import FLAT_PIXELS, FLAT_SHARE, QUANTISATION_DN2, Band
+from closerange.features.disc_band import (
+    FLAT_PIXELS,
+    FLAT_SHARE,
+    IMAGINED_PIXELS,
+    QUANTISATION_DN2,
+    Band,
+)
 from closerange.features.disc_model import blur_px, density, outline_of
-from closerange.geometry.arrays import BoolArray, FloatArray
+from closerange.geometry.arrays import BoolArray, FloatArray, IntArray
 from closerange.geometry.ellipse import axes_of_shape
 from closerange.geometry.least_squares import LeastSquaresFit
 
@@ -65,6 +71,57 @@ def centre_covariance(fit: LeastSquaresFit, band: Band) -> FloatArray:
         return np.full((2, 2), np.inf)  # no contrast: nothing holds the centre
     edge = np.linalg.inv(information)
     return np.asarray(max(rough, floor) * edge + max(1.0, floor) * (whole - edge))
+
+
+def noise_covariance(fit: LeastSquaresFit, band: Band) -> FloatArray:
+    """Return the covariance of the centre from what differs between images of a still scene.
+
+    Roughness of outline, print and light is the same in every image; the noise of pixels is not.
+    The weights know both, so the noise of each pixel is carried through them to the centre.
+    """
+    covariance = fit.covariance()
+    if not np.isfinite(covariance).all():
+        return np.full((2, 2), np.nan)
+    outside, inside = _white_variances(fit, band, covariance)
+    std = np.sqrt(outside + (inside - outside) * band.inside) / band.std
+    by_pixel = covariance[:2] @ fit.jacobian[:-1].T * std
+    return np.asarray(by_pixel @ by_pixel.T)
+
+
+def _white_variances(
+    fit: LeastSquaresFit, band: Band, covariance: FloatArray
+) -> tuple[float, float]:
+    """Grey-value variance outside and inside, from differences of neighbours on flat ground.
+
+    At the edge itself a rough outline would be taken for noise.
+    """
+    flat = band.counted(fit)[0] & ((band.inside < FLAT_SHARE) | (band.inside > 1 - FLAT_SHARE))
+    first, second = _neighbours(band.xy, flat)
+    squares = (np.diff(fit.residuals[:-1][[first, second]], axis=0)[0] * band.std[first]) ** 2
+    # The fit has taken a part of the noise with it: residuals scatter by 1 - J (J'J)^-1 J'.
+    moved = fit.jacobian[second] - fit.jacobian[first]
+    share = 2 - ((moved @ covariance) * moved).sum(axis=1)
+    within = band.inside[first] > 0.5
+    sums = [(squares[side].sum(), share[side].sum()) for side in (~within, within)]
+    if not sums[0][1] > 0:
+        return np.nan, np.nan  # crowded: no flat ground around the disc
+    # Small discs have few flat pixels inside, tiny ones none: then the noise is that outside.
+    outside = sums[0][0] / sums[0][1]
+    imagined = 2 * IMAGINED_PIXELS
+    inside = (sums[1][0] + imagined * outside) / (sums[1][1] + imagined)
+    return max(float(outside), QUANTISATION_DN2), max(float(inside), QUANTISATION_DN2)
+
+
+def _neighbours(xy: FloatArray, chosen: BoolArray) -> tuple[IntArray, IntArray]:
+    """Return the indices of chosen pixels, given row by row, that touch in a row or a column."""
+    by_rows = np.flatnonzero(chosen)
+    by_columns = by_rows[np.argsort(xy[by_rows, 0], kind="stable")]
+    pairs = []
+    for order in (by_rows, by_columns):
+        touch = np.flatnonzero(np.abs(np.diff(xy[order], axis=0)).sum(axis=1) < 1.5)
+        pairs.append((order[touch], order[touch + 1]))
+    rows, columns = pairs
+    return np.append(rows[0], columns[0]), np.append(rows[1], columns[1])
 
 
 def _outline_roughness(fit: LeastSquaresFit, band: Band) -> float | None:

@@ -50,6 +50,9 @@ class Discs:
         blob's pixels.
     cov_px2 : ndarray, shape (N, 2, 2)
         Their covariance in px^2.
+    noise_cov_px2 : ndarray, shape (N, 2, 2)
+        The part of it that pixel noise alone makes: the scatter between images of a still scene;
+        NaN from "border-centroid" and where the fit failed.
     ellipse : ndarray, shape (N, 3)
         Semi-axes a >= b in px, angle of the major axis from +x towards +y in rad, in
         (-pi/2, pi/2].
@@ -72,6 +75,7 @@ class Discs:
 
     xy_px: FloatArray
     cov_px2: FloatArray
+    noise_cov_px2: FloatArray
     ellipse: FloatArray
     blur_px: FloatArray
     contrast: FloatArray
@@ -86,6 +90,7 @@ class Discs:
         shapes: dict[str, tuple[int, ...]] = {
             "xy_px": (count, 2),
             "cov_px2": (count, 2, 2),
+            "noise_cov_px2": (count, 2, 2),
             "ellipse": (count, 3),
             "blur_px": (count,),
             "contrast": (count,),
@@ -152,6 +157,7 @@ def find_discs(
     return Discs(
         xy_px=np.array([fit.xy_px for fit in fits]),
         cov_px2=np.array([fit.cov_px2 for fit in fits]).reshape(-1, 2, 2),
+        noise_cov_px2=np.array([fit.noise_cov_px2 for fit in fits]).reshape(-1, 2, 2),
         ellipse=np.array([fit.ellipse for fit in fits]),
         blur_px=np.array([fit.blur_px for fit in fits]),
         contrast=np.array([fit.contrast for fit in fits]),
@@ -206,6 +212,7 @@ def _border_centroid(found: DiscCandidates, candidate: Candidate, sign: float) -
     return DiscFit(
         xy_px=border_centroid(candidate.border),
         cov_px2=border_centroid_covariance(candidate.border),
+        noise_cov_px2=np.full((2, 2), np.nan),
         ellipse=candidate.outline.axes,
         blur_px=np.nan,
         contrast=sign * candidate.contrast,

@@ -12,6 +12,9 @@ from numpy.typing import ArrayLike, NDArray
 from closerange.errors import InputError
 from closerange.geometry.arrays import FloatArray, IntArray, frozen_array, frozen_ints
 
+SYMMETRY = 1e-9
+"""Share of the standard deviations' product by which a computed matrix may be unsymmetric."""
+
 Key = tuple[str, str, str, str]
 """(camera, placement, reading, point): names one row."""
 
@@ -40,6 +43,9 @@ class ImagePoints:
         Repeated measurement of the same placement; blank when there is only one.
     size_px : dict of str to (int, int)
         Width and height of a camera's images, where known.
+    noise_cov_px2 : ndarray, shape (N, 2, 2)
+        The part of `cov_px2` that differs between readings of a still scene, in px^2; NaN
+        where unknown.
     """
 
     camera: tuple[str, ...]
@@ -52,6 +58,7 @@ class ImagePoints:
     disc_diameter_mm: FloatArray
     reading: tuple[str, ...]
     size_px: Mapping[str, tuple[int, int]] = field(default_factory=dict)
+    noise_cov_px2: FloatArray = field(default_factory=lambda: np.array(np.nan))
 
     def __post_init__(self) -> None:
         count = len(self.camera)
@@ -63,6 +70,9 @@ class ImagePoints:
         set_field = object.__setattr__
         set_field(self, "xy_px", frozen_array(self.xy_px, (count, 2), "xy_px"))
         set_field(self, "cov_px2", frozen_array(self.cov_px2, (count, 2, 2), "cov_px2"))
+        noise = np.asarray(self.noise_cov_px2)
+        noise = noise if noise.ndim else np.full((count, 2, 2), noise)
+        set_field(self, "noise_cov_px2", frozen_array(noise, (count, 2, 2), "noise_cov_px2"))
         set_field(self, "flags", frozen_ints(self.flags, (count,), "flags"))
         set_field(self, "ellipse", frozen_array(self.ellipse, (count, 3), "ellipse"))
         set_field(
@@ -71,12 +81,31 @@ class ImagePoints:
             frozen_array(self.disc_diameter_mm, (count,), "disc_diameter_mm"),
         )
         set_field(self, "size_px", dict(self.size_px))
+        self._require_covariances("cov_px2")
+        self._require_covariances("noise_cov_px2")
         keys = self.keys()
         if len(set(keys)) < count:
             twice = next(key for key in keys if keys.count(key) > 1)
             raise InputError(
                 f"point {twice[3]!r} of camera {twice[0]!r}, placement {twice[1]!r} appears twice",
                 remedy="give each placement its own name, or remove one row",
+            )
+
+    def _require_covariances(self, name: str) -> None:
+        """Refuse what is neither unknown (NaN) nor symmetric and positive definite."""
+        cov: FloatArray = getattr(self, name)
+        xx, xy, yx, yy = cov.reshape(-1, 4).T
+        with np.errstate(invalid="ignore"):
+            size = np.sqrt(xx) * np.sqrt(yy)  # of negative numbers NaN, which no comparison passes
+            good = (size > 0) & (np.maximum(abs(xy), abs(yx)) < size) & np.isfinite(size)
+            good &= abs(xy - yx) <= SYMMETRY * size
+        for row in np.flatnonzero(~good & ~np.isnan(cov).all(axis=(1, 2))):
+            camera, placement, _, point = self.keys()[row]
+            where = f", placement {placement!r}" if placement else ""
+            raise InputError(
+                f"camera {camera!r}{where}, point {point!r}: {name} = {cov[row].tolist()} is not a "
+                "covariance",
+                remedy="give a symmetric positive definite matrix, or NaN where it is not known",
             )
 
     @classmethod
@@ -93,6 +122,7 @@ class ImagePoints:
         ellipse: ArrayLike | None = None,
         disc_diameter_mm: ArrayLike | None = None,
         size_px: Mapping[str, tuple[int, int]] | None = None,
+        noise_cov_px2: ArrayLike | None = None,
     ) -> ImagePoints:
         """Build from whatever is known; the rest becomes NaN, blank or 0.
 
@@ -102,7 +132,7 @@ class ImagePoints:
             One name for all rows, or one a row.
         point : sequence of str
             One name a row.
-        xy_px, cov_px2, flags, ellipse, disc_diameter_mm, size_px
+        xy_px, cov_px2, flags, ellipse, disc_diameter_mm, size_px, noise_cov_px2
             As the attributes; `disc_diameter_mm` may be one number for all rows.
 
         Returns
@@ -133,6 +163,7 @@ class ImagePoints:
             disc_diameter_mm=numbers(disc_diameter_mm, (count,)),
             reading=names(reading),
             size_px=size_px or {},
+            noise_cov_px2=numbers(noise_cov_px2, (count, 2, 2)),
         )
 
     def __len__(self) -> int:
@@ -158,6 +189,7 @@ class ImagePoints:
             disc_diameter_mm=np.concatenate([self.disc_diameter_mm, other.disc_diameter_mm]),
             reading=self.reading + other.reading,
             size_px={**self.size_px, **other.size_px},
+            noise_cov_px2=np.concatenate([self.noise_cov_px2, other.noise_cov_px2]),
         )
 
     def keys(self) -> list[Key]:
@@ -201,6 +233,7 @@ class ImagePoints:
             disc_diameter_mm=self.disc_diameter_mm[index],
             reading=tuple(self.reading[i] for i in index),
             size_px=self.size_px,
+            noise_cov_px2=self.noise_cov_px2[index],
         )
 
     def of_camera(self, camera: str) -> ImagePoints:

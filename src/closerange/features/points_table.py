@@ -8,14 +8,32 @@ import numpy as np
 
 from closerange.errors import InputError, TableError
 from closerange.features.image_points import ImagePoints
-from closerange.files import CsvTable, float_text, read_csv, text_cell, write_csv
-from closerange.flags import Flag, format_flags, parse_flags
+from closerange.files import (
+    CsvTable,
+    check_unique,
+    flag_cell,
+    float_text,
+    read_csv,
+    text_cell,
+    write_csv,
+)
+from closerange.flags import Flag, format_flags
 from closerange.geometry.arrays import FloatArray
 
 REQUIRED = ("camera", "point", "x_px", "y_px")
 COVARIANCE = ("cov_xx_px2", "cov_xy_px2", "cov_yy_px2")
+NOISE = ("noise_xx_px2", "noise_xy_px2", "noise_yy_px2")
 ELLIPSE = ("ellipse_a_px", "ellipse_b_px", "ellipse_angle_rad")
-OPTIONAL = ("placement", "reading", *COVARIANCE, "flags", *ELLIPSE, "disc_diameter_mm", "mismatch")
+OPTIONAL = (
+    "placement",
+    "reading",
+    *COVARIANCE,
+    *NOISE,
+    "flags",
+    *ELLIPSE,
+    "disc_diameter_mm",
+    "mismatch",
+)
 
 
 def read_points(*paths: Path | str) -> ImagePoints:
@@ -40,7 +58,7 @@ def read_points(*paths: Path | str) -> ImagePoints:
     """
     joined: ImagePoints | None = None
     for path in paths:
-        points = _read_one(path)
+        points = points_of_table(read_csv(path, required=REQUIRED, optional=OPTIONAL))
         if joined is None:
             joined = points
             continue
@@ -68,7 +86,12 @@ def write_points(points: ImagePoints, path: Path | str) -> None:
     FileError
         If it cannot be written.
     """
-    cov = points.cov_px2
+    columns = points_columns(points)
+    write_csv(path, list(columns), zip(*columns.values(), strict=True))
+
+
+def points_columns(points: ImagePoints) -> dict[str, list[str]]:
+    """Return the columns of a points table as texts, in order, without the empty ones."""
     columns: dict[str, list[str]] = {
         "camera": list(points.camera),
         "placement": list(points.placement),
@@ -76,24 +99,32 @@ def write_points(points: ImagePoints, path: Path | str) -> None:
         "point": list(points.point),
         "x_px": [float_text(x) for x in points.xy_px[:, 0]],
         "y_px": [float_text(y) for y in points.xy_px[:, 1]],
-        "cov_xx_px2": [float_text(value) for value in cov[:, 0, 0]],
-        "cov_xy_px2": [float_text(value) for value in cov[:, 0, 1]],
-        "cov_yy_px2": [float_text(value) for value in cov[:, 1, 1]],
+        **_covariance_cells(points.cov_px2, COVARIANCE),
+        **_covariance_cells(points.noise_cov_px2, NOISE),
         **{name: [float_text(v) for v in points.ellipse[:, i]] for i, name in enumerate(ELLIPSE)},
         "disc_diameter_mm": [float_text(value) for value in points.disc_diameter_mm],
         "flags": [format_flags(int(flag)) for flag in points.flags],
     }
     always = {"camera", "placement", "point", "x_px", "y_px", "flags"}
-    kept = {name: cells for name, cells in columns.items() if name in always or any(cells)}
-    write_csv(path, list(kept), zip(*kept.values(), strict=True))
+    return {name: cells for name, cells in columns.items() if name in always or any(cells)}
 
 
-def _read_one(path: Path | str) -> ImagePoints:
-    table = read_csv(path, required=REQUIRED, optional=OPTIONAL)
-    flags = [
-        _flag(text, table.where(row, "flags")) for row, text in enumerate(table.texts("flags"))
-    ]
-    _check_unique(table)
+def _covariance_cells(cov: FloatArray, names: tuple[str, str, str]) -> dict[str, list[str]]:
+    """Write the three terms of symmetric matrices."""
+    terms = (cov[:, 0, 0], cov[:, 0, 1], cov[:, 1, 1])
+    return {
+        name: [float_text(value) for value in term] for name, term in zip(names, terms, strict=True)
+    }
+
+
+def points_of_table(table: CsvTable) -> ImagePoints:
+    """Check and convert the cells of a points table; see `read_points`."""
+    flags = [flag_cell(t, table.where(i, "flags")) for i, t in enumerate(table.texts("flags"))]
+    check_unique(
+        table,
+        ("point", "camera", "placement", "reading"),
+        remedy="give each placement its own name, or remove one row",
+    )
     return ImagePoints.of(
         camera=[
             text_cell(t, table.where(i, "camera")) for i, t in enumerate(table.texts("camera"))
@@ -102,33 +133,12 @@ def _read_one(path: Path | str) -> ImagePoints:
         reading=table.texts("reading"),
         point=[text_cell(t, table.where(i, "point")) for i, t in enumerate(table.texts("point"))],
         xy_px=_positions(table, flags),
-        cov_px2=_covariances(table),
+        cov_px2=_covariances(table, COVARIANCE),
+        noise_cov_px2=_covariances(table, NOISE),
         flags=flags,
         ellipse=_ellipses(table),
         disc_diameter_mm=_diameters(table),
     )
-
-
-def _flag(text: str, where: str) -> Flag:
-    try:
-        return parse_flags(text)
-    except ValueError as error:
-        raise TableError(
-            f"{where}: {error}", remedy="use names of the registry, joined by |"
-        ) from error
-
-
-def _check_unique(table: CsvTable) -> None:
-    seen: dict[tuple[str, ...], int] = {}
-    names = ("camera", "placement", "reading", "point")
-    for row, key in enumerate(zip(*(table.texts(name) for name in names), strict=True)):
-        if key in seen:
-            raise TableError(
-                f"{table.where(row, 'point')}: point {key[3]!r} of camera {key[0]!r}, placement "
-                f"{key[1]!r} is also in row {table.line[seen[key]]}",
-                remedy="give each placement its own name, or remove one row",
-            )
-        seen[key] = row
 
 
 def _positions(table: CsvTable, flags: list[Flag]) -> FloatArray:
@@ -144,15 +154,15 @@ def _positions(table: CsvTable, flags: list[Flag]) -> FloatArray:
     return xy
 
 
-def _covariances(table: CsvTable) -> FloatArray:
+def _covariances(table: CsvTable, names: tuple[str, str, str]) -> FloatArray:
     """Read covariances; a row has all three terms or none."""
-    terms = np.column_stack([table.floats(name, blank=np.nan) for name in COVARIANCE])
+    terms = np.column_stack([table.floats(name, blank=np.nan) for name in names])
     known = np.isfinite(terms)
     for row in np.flatnonzero(known.any(axis=1)):
         xx, xy, yy = terms[row]
         if not known[row].all() or xx <= 0 or yy <= 0 or xx * yy <= xy**2:
             raise TableError(
-                f"{table.where(int(row), COVARIANCE[0])}: ({xx}, {xy}, {yy}) is not a covariance",
+                f"{table.where(int(row), names[0])}: ({xx}, {xy}, {yy}) is not a covariance",
                 remedy="write all three terms of a positive definite matrix, or leave all blank",
             )
     return terms[:, [0, 1, 1, 2]].reshape(-1, 2, 2)

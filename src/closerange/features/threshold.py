@@ -11,6 +11,11 @@ from numpy.typing import NDArray
 from closerange.errors import InputError
 from closerange.geometry.arrays import FloatArray
 
+NOISE_CEILING = 0.61
+"""Blur-minimum strength, in standard deviations of the pixels' noise, that one pixel in a thousand
+of pure white noise exceeds (9 million pixels drawn; 0.607). An image of parts has an edge at one
+pixel in fifty or so: noise then makes at most a few per cent of what is called an edge."""
+
 
 @dataclass(frozen=True, slots=True)
 class ThresholdReport:
@@ -78,6 +83,50 @@ def threshold_report(pixels: NDArray[Any], *, floor: float = -np.inf) -> Thresho
     )
 
 
+def edge_threshold(strength: NDArray[Any], *, noise: float) -> ThresholdReport:
+    """Choose Trussell's threshold for an edge-strength image by a start rule that noise survives.
+
+    Parameters
+    ----------
+    strength : ndarray
+        Edge strengths of `closerange.features.edge_operators.blur_minimum` with its blur of
+        3 x 3 px, rounded or not; what is below 0 counts as 0.
+    noise : float
+        Standard deviation of the noise of single pixels of the image that they come from; see
+        `closerange.features.edge_operators.pixel_noise`.
+
+    Returns
+    -------
+    ThresholdReport
+        The lowest fixed point that is not below the noise's floor; the floor itself if there is
+        none. All fixed points, and the floor, are reported.
+
+    Raises
+    ------
+    InputError
+        If there are no pixels, some are NaN, or the noise is not a finite number of 0 or more.
+
+    Notes
+    -----
+    Nearly all pixels of an edge-strength image are noise. From about 5 grey levels of noise
+    the noise has a fixed point of its own, which splits its weaker from its stronger half; the
+    thesis' start, a mean of the image, lies below and ends there: a quarter of all pixels then
+    count as edges. So the iteration starts at a floor that the noise does not reach, and what
+    lies below is not accepted. The LOWEST fixed point above is taken, not the one of the
+    largest between-class variance: above the floor everything is edge, and a higher fixed point
+    would only part strong edges (highlights) from faint ones.
+    """
+    if not (np.isfinite(noise) and noise >= 0):
+        raise InputError(f"the noise is {noise}", remedy="give a finite number of grey levels")
+    floor = NOISE_CEILING * noise
+    levels, step = _levels(strength)
+    report = threshold_report(levels)
+    points = tuple(step * point for point in report.fixed_points)
+    variances = tuple(step**2 * variance for variance in report.between_class_variance)
+    threshold = min((point for point in points if point >= floor), default=floor)
+    return ThresholdReport(threshold, points, variances, floor)
+
+
 def fixed_points(pixels: NDArray[Any]) -> tuple[float, ...]:
     """Return all thresholds T that equal half the sum of the means below and above.
 
@@ -126,6 +175,23 @@ def trussell_threshold(pixels: NDArray[Any], start: float | None = None) -> floa
             break
         threshold = following
     return threshold
+
+
+def _levels(strength: NDArray[Any]) -> tuple[NDArray[Any], float]:
+    """Return strengths as whole numbers, which are counted instead of sorted, and their step.
+
+    The step is 1/65535 of the largest, far below any noise.
+    """
+    clipped = np.maximum(strength, 0)
+    if clipped.dtype in (np.uint8, np.uint16):
+        return clipped, 1.0
+    largest = float(clipped.max(initial=0))
+    if not np.isfinite(largest):
+        raise InputError(
+            "edge strengths are not finite", remedy="remove NaN and infinite values first"
+        )
+    step = largest / 65535 or 1.0
+    return np.rint(clipped * (1 / step)).astype(np.uint16), step
 
 
 def _histogram(pixels: NDArray[Any]) -> tuple[FloatArray, FloatArray]:

@@ -6,6 +6,8 @@ Each table's reader and writer live beside its type; here are only the dialects.
 from closerange.files.atomic import write_bytes, write_text
 from closerange.files.csv_table import (
     CsvTable,
+    check_unique,
+    flag_cell,
     float_cell,
     float_text,
     read_csv,
@@ -25,7 +27,9 @@ __all__ = [
     "MAX_TABLE_BYTES",
     "MAX_TEXT_BYTES",
     "CsvTable",
+    "check_unique",
     "dump_json",
+    "flag_cell",
     "float_cell",
     "float_text",
     "load_json",

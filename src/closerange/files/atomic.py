@@ -31,7 +31,7 @@ def write_bytes(path: Path | str, content: bytes) -> None:
     path = Path(path)
     temporary: str | None = None
     try:
-        _refuse_folder(path)
+        _refuse_folder_or_device(path)
         handle, temporary = tempfile.mkstemp(
             prefix=f".{path.name}.", suffix=".part", dir=path.parent
         )
@@ -80,9 +80,11 @@ def write_text(path: Path | str, text: str) -> None:
     write_bytes(path, content)
 
 
-def _refuse_folder(path: Path) -> None:
+def _refuse_folder_or_device(path: Path) -> None:
     if path.is_dir():
         raise FileError(f"{path}: is a folder", remedy="name a file in it")
+    if path.exists() and not path.is_file():  # an administrator would replace /dev/null by a table
+        raise FileError(f"{path}: is no regular file", remedy="name a file on disk")
 
 
 def _mode_of_new_file(path: Path) -> int:

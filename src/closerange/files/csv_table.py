@@ -14,6 +14,7 @@ from pathlib import Path
 from closerange.errors import CloseRangeWarning, TableError
 from closerange.files.atomic import write_text
 from closerange.files.limited import MAX_TABLE_BYTES, read_text
+from closerange.flags import Flag, parse_flags
 
 # float() would also take "nan", "inf", "1_000" and blanks inside other alphabets' digits
 _NUMBER = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?", re.ASCII)
@@ -205,6 +206,62 @@ def text_cell(text: str, where: str) -> str:
     if not text:
         raise TableError(f"{where}: the cell is empty", remedy="write a name")
     return text
+
+
+def flag_cell(text: str, where: str) -> Flag:
+    """Read one cell as quality bits.
+
+    Parameters
+    ----------
+    text : str
+        Names joined by ``|``; empty when nothing is wrong.
+    where : str
+        File, row and column for the message.
+
+    Returns
+    -------
+    Flag
+        The combined bits.
+
+    Raises
+    ------
+    TableError
+        If a name is not in the registry.
+    """
+    try:
+        return parse_flags(text)
+    except ValueError as error:
+        raise TableError(
+            f"{where}: {error}", remedy="use names of the registry, joined by |"
+        ) from error
+
+
+def check_unique(table: CsvTable, key: Sequence[str], *, remedy: str) -> None:
+    """Refuse a table that has two rows of one name.
+
+    Parameters
+    ----------
+    table : CsvTable
+        The table.
+    key : sequence of str
+        Columns that name a row together; the first is blamed.
+    remedy : str
+        What to do about it.
+
+    Raises
+    ------
+    TableError
+        If two rows agree in all of `key`; it names both.
+    """
+    seen: dict[tuple[str, ...], int] = {}
+    for row, cells in enumerate(zip(*(table.texts(name) for name in key), strict=True)):
+        if cells in seen:
+            named = ", ".join(f"{name} {cell!r}" for name, cell in zip(key, cells, strict=True))
+            raise TableError(
+                f"{table.where(row, key[0])}: {named} is also in row {table.line[seen[cells]]}",
+                remedy=remedy,
+            )
+        seen[cells] = row
 
 
 def _rows(text: str, source: str) -> list[tuple[int, list[str]]]:

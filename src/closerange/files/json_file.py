@@ -64,7 +64,7 @@ def parse_json(text: str, *, source: str) -> Any:
     except json.JSONDecodeError as error:
         raise SchemaError(
             f"{source}: line {error.lineno}, column {error.colno}: {error.msg}",
-            remedy="correct the JSON",
+            remedy="correct the JSON" if error.pos else "this is no JSON file: name the right one",
         ) from error
     except (ValueError, RecursionError) as error:
         if isinstance(error, SchemaError):

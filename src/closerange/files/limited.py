@@ -54,6 +54,8 @@ def read_limited(path: Path | str, max_bytes: int) -> bytes:
             content = stream.read(status.st_size + 1)  # reserves what it is asked for
     except FileNotFoundError as error:
         raise FileError(f"{path}: no such file", remedy="check the path") from error
+    except IsADirectoryError as error:
+        raise FileError(f"{path}: is a folder", remedy="name a file in it") from error
     except OSError as error:
         raise FileError(
             f"{path}: {error.strerror or error}", remedy="check the path and its rights"

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import ArrayLike
 
-from closerange.geometry.arrays import FloatArray
+from closerange.geometry.arrays import BoolArray, FloatArray, all_finite
 
 
 def mahalanobis_squared(errors: ArrayLike, cov: ArrayLike) -> FloatArray:
@@ -31,6 +31,48 @@ def mahalanobis_squared(errors: ArrayLike, cov: ArrayLike) -> FloatArray:
     squared: FloatArray = np.sum(errors * solved, axis=1)
     squared[bad] = np.nan
     return squared
+
+
+def positive_definite(cov: FloatArray) -> BoolArray:
+    """Return which matrices are finite and positive definite.
+
+    Parameters
+    ----------
+    cov : ndarray, shape (M, K, K)
+        Symmetric matrices.
+
+    Returns
+    -------
+    ndarray of bool, shape (M,)
+        False also where NaN says "unknown".
+    """
+    known = all_finite(cov, (1, 2))
+    known[known] = np.linalg.eigvalsh(cov[known])[:, 0] > 0
+    return known
+
+
+def limited_part(part: FloatArray, whole: FloatArray) -> FloatArray:
+    """Keep a part of a covariance from exceeding the whole in any direction.
+
+    Parameters
+    ----------
+    part, whole : ndarray, shape (M, K, K)
+        Covariances that were estimated apart, so that chance can make the part the larger.
+
+    Returns
+    -------
+    ndarray, shape (M, K, K)
+        The part, shortened along those axes in which it exceeds the whole; NaN where either is
+        unknown or the whole is not positive definite.
+    """
+    known = positive_definite(whole) & all_finite(part, (1, 2))
+    result = np.full_like(whole, np.nan)
+    root = np.linalg.cholesky(whole[known])
+    half_way = np.swapaxes(np.linalg.solve(root, part[known]), 1, 2)
+    shares, axes = np.linalg.eigh(np.linalg.solve(root, half_way))
+    axes = root @ axes
+    result[known] = (axes * np.minimum(shares, 1)[:, None]) @ np.swapaxes(axes, 1, 2)
+    return result
 
 
 def region_limit(dimensions: int, dof: int | None, *, probability: float = 0.95) -> float:

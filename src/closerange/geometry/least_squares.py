@@ -20,6 +20,9 @@ LARGEST_DAMPING = 1e12
 # The first ends the search; where residuals are large and parameters hang together, each step
 # gains only a little less than the one before, and the second is good enough when steps run out.
 GAIN_LIMIT, GAIN_ENOUGH = 1e-12, 1e-7
+# A residual is the difference of two numbers that a few operations have rounded: exact data leave
+# a cost of this share of the numbers' squares, in which no step finds a way down.
+ROUNDING = (4 * np.finfo(np.float64).eps) ** 2
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -80,6 +83,7 @@ def levenberg_marquardt(
     step_limit: float = 1e-10,
     damping: float = 1e-3,
     gain_limit: float = GAIN_LIMIT,
+    terms: float = 0.0,
 ) -> LeastSquaresFit:
     """Minimise a sum of squares.
 
@@ -99,6 +103,10 @@ def levenberg_marquardt(
         First damping, relative to the diagonal of J'J.
     gain_limit : float, optional
         It has also converged when the best step would lower the cost by less than this share.
+    terms : float, optional
+        Sum of squares of the numbers whose differences the residuals are, as of all observed
+        coordinates: it has also converged when the best step would gain no more than their
+        rounding. Without it, exact data may never converge.
 
     Returns
     -------
@@ -121,7 +129,7 @@ def levenberg_marquardt(
         gain = float(step @ (damping * step - gradient))
         small = np.linalg.norm(step) <= step_limit * (np.linalg.norm(x * scale) + step_limit)
         # Strong damping makes any step small; only a lightly damped one proves a minimum.
-        if damping <= 1 and gain <= gain_limit * cost:
+        if damping <= 1 and gain <= max(gain_limit * cost, ROUNDING * terms):
             converged = True
             break
         iterations += 1

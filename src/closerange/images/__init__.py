@@ -15,13 +15,17 @@ from closerange.images.checks import (
     structure_range,
 )
 from closerange.images.decode import MAX_IMAGE_BYTES, MAX_PIXELS, read_image
+from closerange.images.exposures import (
+    Exposures,
+    check_exposures,
+    read_exposures,
+)
 from closerange.images.folder import list_images, natural_key
 from closerange.images.frame import Frame
 from closerange.images.headers import ImageHeader, read_header
 from closerange.images.image_sets import (
     ImageSet,
     check_duplicates,
-    check_simultaneous,
     check_sizes,
     distinct,
     group_images,
@@ -32,12 +36,13 @@ from closerange.images.image_sets import (
 __all__ = [
     "MAX_IMAGE_BYTES",
     "MAX_PIXELS",
+    "Exposures",
     "Frame",
     "ImageHeader",
     "ImageSet",
     "check_duplicates",
+    "check_exposures",
     "check_frame",
-    "check_simultaneous",
     "check_sizes",
     "comb_share",
     "distinct",
@@ -47,6 +52,7 @@ __all__ = [
     "noise_level",
     "placement_and_reading",
     "placement_name",
+    "read_exposures",
     "read_header",
     "read_image",
     "saturated_share",

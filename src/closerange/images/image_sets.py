@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import hashlib
-import math
 import re
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -226,46 +225,6 @@ def check_sizes(frames: Iterable[Frame]) -> None:
                 f"({other_kind})",
                 remedy="use images of one camera, uncropped and with the same settings",
             )
-
-
-def check_simultaneous(frames: Iterable[Frame], *, tolerance_s: float) -> None:
-    """Refuse a set of frames whose exposures lie further apart than is allowed.
-
-    Parameters
-    ----------
-    frames : iterable of Frame
-        One set. Frames without a time are passed over.
-    tolerance_s : float
-        Largest allowed difference between the first and the last exposure, in seconds. An
-        object at v mm/s moves tolerance_s * v mm meanwhile: choose it so that this stays
-        below the accuracy that is asked for.
-
-    Raises
-    ------
-    InputError
-        If the times differ by more, or the tolerance or a time is not a finite number.
-    """
-    if not (math.isfinite(tolerance_s) and tolerance_s >= 0):
-        raise InputError(
-            f"tolerance_s is {tolerance_s}", remedy="give a number of seconds, 0 or more"
-        )
-    timed = [(frame.time_s, frame) for frame in frames if frame.time_s is not None]
-    for time_s, frame in timed:
-        if not math.isfinite(time_s):
-            raise InputError(
-                f"{_name(frame.camera, frame.source)}: its time is {time_s}",
-                remedy="give a finite number of seconds, or no time",
-            )
-    if len(timed) < 2:
-        return
-    first_s, first = min(timed, key=lambda item: item[0])
-    last_s, last = max(timed, key=lambda item: item[0])
-    if last_s - first_s > tolerance_s:
-        raise InputError(
-            f"{_name(first.camera, first.source)} and {_name(last.camera, last.source)} were "
-            f"taken {last_s - first_s:.6g} s apart, the limit is {tolerance_s:.6g} s",
-            remedy="trigger the cameras together, or put images of one moment in a set",
-        )
 
 
 def _by_key(camera: str, paths: Sequence[Path], pattern: str | None) -> dict[tuple[str, str], Path]:

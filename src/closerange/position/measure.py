@@ -11,6 +11,7 @@ from closerange.errors import CloseRangeWarning
 from closerange.features.image_points import ImagePoints
 from closerange.flags import Flag
 from closerange.geometry.arrays import BoolArray, FloatArray, IntArray, all_finite
+from closerange.geometry.covariance import propagate
 from closerange.geometry.intersection import widest_angle
 from closerange.position.observed import Observed, arrange
 from closerange.position.positions import Positions
@@ -61,7 +62,8 @@ def measure_points(rig: Rig, points: ImagePoints) -> Positions:
     -----
     Equations (2.9) to (2.11) and (5.6), then weighted reprojection error minimised by
     Gauss-Newton. Disc centres are corrected for perspective and lens (see
-    `closerange.rig.disc_bias`). The covariance adds the image points' part and the calibration's.
+    `closerange.rig.disc_bias`). The covariance adds the image points' part and the calibration's;
+    what differs between readings is propagated from the image points' noise alone.
     """
     observed = arrange(rig, points)
     observed = _without_disc_bias(rig, observed)
@@ -84,7 +86,15 @@ def measure_points(rig: Rig, points: ImagePoints) -> Positions:
         cameras=used,
         flags=flags,
         dof=None if observed.own_cov else rig.dof,
+        noise_cov_mm2=_noise(observed, solution),
     )
+
+
+def _noise(observed: Observed, solution: Solution) -> FloatArray:
+    """Propagate the noise of the views that take part; NaN where one of them has none stated."""
+    noise = np.where(observed.used[..., None, None], observed.noise_cov_px2, 0.0)
+    cov: FloatArray = propagate(solution.by_image, noise).sum(axis=1)
+    return cov
 
 
 def _without_disc_bias(rig: Rig, observed: Observed) -> Observed:

@@ -24,6 +24,8 @@ class Observed:
         Observed px; NaN where not seen.
     cov_px2 : ndarray, shape (M, C, 2, 2)
         Covariance; that of the rig where none was given.
+    noise_cov_px2 : ndarray, shape (M, C, 2, 2)
+        The part that differs between readings; NaN where it was not given.
     used : ndarray of bool, shape (M, C)
         Which views take part.
     flags : ndarray of int, shape (M,)
@@ -41,6 +43,7 @@ class Observed:
     point: tuple[str, ...]
     xy_px: FloatArray
     cov_px2: FloatArray
+    noise_cov_px2: FloatArray
     used: BoolArray
     flags: IntArray
     ellipse: FloatArray
@@ -104,6 +107,7 @@ def arrange(rig: Rig, points: ImagePoints) -> Observed:
         point=tuple(key[2] for key in keys),
         xy_px=xy,
         cov_px2=cov,
+        noise_cov_px2=table(points.noise_cov_px2, 2, 2),
         used=used,
         flags=np.bitwise_or.reduce(carried, axis=1) if keys else np.zeros(0, np.int64),
         ellipse=table(points.ellipse, 3),

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
@@ -35,6 +35,9 @@ class Positions:
     dof : int or None
         Degrees of freedom of the variance behind `cov_mm2`; None when the covariances of the
         image points were given. A 95 % region is ``e' cov^-1 e <= 3 F(0.95; 3, dof)``.
+    noise_cov_mm2 : ndarray, shape (M, 3, 3)
+        The part of `cov_mm2` that differs between readings of a still scene, mm^2; NaN where
+        unknown.
     """
 
     placement: tuple[str, ...]
@@ -46,6 +49,7 @@ class Positions:
     flags: IntArray
     reading: tuple[str, ...]
     dof: int | None = None
+    noise_cov_mm2: FloatArray = field(default_factory=lambda: np.array(np.nan))
 
     def __post_init__(self) -> None:
         count = len(self.point)
@@ -55,6 +59,10 @@ class Positions:
             object.__setattr__(self, name, tuple(getattr(self, name)))
         object.__setattr__(self, "xyz_mm", frozen_array(self.xyz_mm, (count, 3), "xyz_mm"))
         object.__setattr__(self, "cov_mm2", frozen_array(self.cov_mm2, (count, 3, 3), "cov_mm2"))
+        noise = np.asarray(self.noise_cov_mm2)
+        noise = noise if noise.ndim else np.full((count, 3, 3), noise)
+        noise = frozen_array(noise, (count, 3, 3), "noise_cov_mm2")
+        object.__setattr__(self, "noise_cov_mm2", noise)
         object.__setattr__(
             self, "residual_px", frozen_array(self.residual_px, (count,), "residual_px")
         )
@@ -92,6 +100,7 @@ class Positions:
             flags=self.flags[index],
             reading=texts(self.reading),
             dof=self.dof,
+            noise_cov_mm2=self.noise_cov_mm2[index],
         )
 
     def to_csv(self, path: Path | str) -> None:

@@ -7,14 +7,23 @@ from pathlib import Path
 import numpy as np
 
 from closerange.errors import TableError
-from closerange.files import CsvTable, float_text, read_csv, text_cell, write_csv
-from closerange.flags import Flag, format_flags, parse_flags
+from closerange.files import (
+    CsvTable,
+    check_unique,
+    flag_cell,
+    float_text,
+    read_csv,
+    text_cell,
+    write_csv,
+)
+from closerange.flags import Flag, format_flags
 from closerange.geometry.arrays import FloatArray, IntArray
 from closerange.position.positions import Positions
 
 REQUIRED = ("placement", "point", "x_mm", "y_mm", "z_mm")
 COVARIANCE = ("cov_xx_mm2", "cov_xy_mm2", "cov_xz_mm2", "cov_yy_mm2", "cov_yz_mm2", "cov_zz_mm2")
-OPTIONAL = (*COVARIANCE, "residual_px", "cameras", "flags", "reading")
+NOISE = tuple(name.replace("cov", "noise") for name in COVARIANCE)
+OPTIONAL = (*COVARIANCE, *NOISE, "residual_px", "cameras", "flags", "reading")
 
 MAX_CAMERAS = 1_000_000
 """Largest count of cameras read: far beyond any rig, and a whole number in every type."""
@@ -23,7 +32,7 @@ _UPPER = np.triu_indices(3)
 
 
 def write_positions(positions: Positions, path: Path | str) -> None:
-    """Write a positions table; the column `reading` only if there are readings.
+    """Write a positions table; columns of readings and of noise only if there is any.
 
     Parameters
     ----------
@@ -37,19 +46,25 @@ def write_positions(positions: Positions, path: Path | str) -> None:
     FileError
         If it cannot be written.
     """
-    cov = positions.cov_mm2[:, _UPPER[0], _UPPER[1]]
     columns: dict[str, list[str]] = {"placement": list(positions.placement)}
     if any(positions.reading):
         columns["reading"] = list(positions.reading)
     columns["point"] = list(positions.point)
     for axis, name in enumerate(("x_mm", "y_mm", "z_mm")):
         columns[name] = [float_text(value) for value in positions.xyz_mm[:, axis]]
-    for term, name in enumerate(COVARIANCE):
-        columns[name] = [float_text(value) for value in cov[:, term]]
+    columns |= _covariance_cells(positions.cov_mm2, COVARIANCE)
+    noise = _covariance_cells(positions.noise_cov_mm2, NOISE)
+    columns |= noise if any(map(any, noise.values())) else {}
     columns["residual_px"] = [float_text(value) for value in positions.residual_px]
     columns["cameras"] = [str(count) for count in positions.cameras]
     columns["flags"] = [format_flags(int(flag)) for flag in positions.flags]
     write_csv(path, list(columns), zip(*columns.values(), strict=True))
+
+
+def _covariance_cells(cov: FloatArray, names: tuple[str, ...]) -> dict[str, list[str]]:
+    """Write the six terms of symmetric matrices."""
+    terms = cov[:, _UPPER[0], _UPPER[1]]
+    return {name: [float_text(value) for value in terms[:, i]] for i, name in enumerate(names)}
 
 
 def read_positions(path: Path | str) -> Positions:
@@ -73,8 +88,12 @@ def read_positions(path: Path | str) -> Positions:
         If a row breaks the contract: it names file, row, column and remedy.
     """
     table = read_csv(path, required=REQUIRED, optional=OPTIONAL)
-    flags = [_flag(text, table.where(i, "flags")) for i, text in enumerate(table.texts("flags"))]
-    _check_unique(table)
+    flags = [flag_cell(t, table.where(i, "flags")) for i, t in enumerate(table.texts("flags"))]
+    check_unique(
+        table,
+        ("point", "placement", "reading"),
+        remedy="number repeated measurements in a column 'reading'",
+    )
     xyz = _coordinates(table, flags)
     return Positions(
         placement=tuple(table.texts("placement")),
@@ -83,31 +102,12 @@ def read_positions(path: Path | str) -> Positions:
         ),
         reading=tuple(table.texts("reading")),
         xyz_mm=xyz,
-        cov_mm2=_covariances(table),
+        cov_mm2=_covariances(table, COVARIANCE),
         residual_px=np.array(table.floats("residual_px", blank=np.nan)),
         cameras=_counts(table),
         flags=np.array(flags, dtype=np.int64),
+        noise_cov_mm2=_covariances(table, NOISE),
     )
-
-
-def _flag(text: str, where: str) -> Flag:
-    try:
-        return parse_flags(text)
-    except ValueError as error:
-        raise TableError(f"{where}: {error}", remedy="use names of the registry") from error
-
-
-def _check_unique(table: CsvTable) -> None:
-    seen: dict[tuple[str, ...], int] = {}
-    names = ("placement", "reading", "point")
-    for row, key in enumerate(zip(*(table.texts(name) for name in names), strict=True)):
-        if key in seen:
-            raise TableError(
-                f"{table.where(row, 'point')}: point {key[2]!r}, placement {key[0]!r} is also in "
-                f"row {table.line[seen[key]]}",
-                remedy="number repeated measurements in a column 'reading'",
-            )
-        seen[key] = row
 
 
 def _coordinates(table: CsvTable, flags: list[Flag]) -> FloatArray:
@@ -122,9 +122,9 @@ def _coordinates(table: CsvTable, flags: list[Flag]) -> FloatArray:
     return xyz
 
 
-def _covariances(table: CsvTable) -> FloatArray:
+def _covariances(table: CsvTable, names: tuple[str, ...]) -> FloatArray:
     """Read covariances; a row has all six terms or none."""
-    terms = np.column_stack([table.floats(name, blank=np.nan) for name in COVARIANCE])
+    terms = np.column_stack([table.floats(name, blank=np.nan) for name in names])
     cov = np.empty((len(table), 3, 3))
     cov[:, _UPPER[0], _UPPER[1]] = terms
     cov[:, _UPPER[1], _UPPER[0]] = terms
@@ -132,7 +132,7 @@ def _covariances(table: CsvTable) -> FloatArray:
     for row in np.flatnonzero(known.any(axis=1)):
         if not known[row].all() or np.linalg.eigvalsh(cov[row])[0] <= 0:
             raise TableError(
-                f"{table.where(int(row), COVARIANCE[0])}: not a positive definite covariance",
+                f"{table.where(int(row), names[0])}: not a positive definite covariance",
                 remedy="write all six terms of a covariance, or leave all blank",
             )
     return cov

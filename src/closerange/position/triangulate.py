@@ -27,6 +27,8 @@ class Solution:
         Observed minus calculated; NaN where not used.
     image_cov_mm2, calibration_cov_mm2 : ndarray, shape (M, 3, 3)
         Covariance from the image points and from the calibration.
+    by_image : ndarray, shape (M, C, 3, 2)
+        Derivatives of the position by the image points, mm / px; 0 for views not used.
     predicted_px2 : ndarray, shape (M, C, 2, 2)
         Covariance of the pixel position that the calibration alone leaves open.
     """
@@ -35,6 +37,7 @@ class Solution:
     residual_px: FloatArray
     image_cov_mm2: FloatArray
     calibration_cov_mm2: FloatArray
+    by_image: FloatArray
     predicted_px2: FloatArray
 
 
@@ -124,10 +127,12 @@ def solve_points(rig: Rig, xy_px: FloatArray, cov_px2: FloatArray, used: BoolArr
     image_cov = _inverse((weighted @ jacobian).sum(axis=1))
     by_parameter = _parameter_jacobian(rig, refined, used)
     predicted = propagate(by_parameter, rig.parameter_cov)
-    # X = argmin |W^(1/2) (x - f(X; a))|, hence dX/da = -(J'WJ)^-1 J'W df/da
+    # X = argmin |W^(1/2) (x - f(X; a))|, hence dX/dx = (J'WJ)^-1 J'W, dX/da = -dX/dx df/da
+    by_image = image_cov[:, None] @ weighted
     sensitivity = -image_cov @ (weighted @ by_parameter).sum(axis=1)
     seen = np.where(used[:, :, None], residual, np.nan)
-    return Solution(refined, seen, image_cov, propagate(sensitivity, rig.parameter_cov), predicted)
+    calibration_cov = propagate(sensitivity, rig.parameter_cov)
+    return Solution(refined, seen, image_cov, calibration_cov, by_image, predicted)
 
 
 def _views(

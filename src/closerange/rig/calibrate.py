@@ -2,18 +2,17 @@
 
 from __future__ import annotations
 
-import warnings
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from closerange.errors import CloseRangeWarning, InputError
+from closerange.errors import GeometryError
 from closerange.features.control import ControlPoints
 from closerange.features.image_points import ImagePoints
-from closerange.flags import Flag
 from closerange.geometry.arrays import BoolArray, FloatArray, IntArray
+from closerange.rig.camera import Camera
 from closerange.rig.diagnosis import (
     BAD_PX,
     BAD_SHARE,
@@ -21,13 +20,20 @@ from closerange.rig.diagnosis import (
     explain_camera,
     explain_placement,
 )
+from closerange.rig.findings import (
+    bias_report,
+    bounding_box,
+    checked_volume,
+    discordant,
+    residual_table,
+    warn_of,
+)
 from closerange.rig.fit_report import fit_report
 from closerange.rig.model_choice import candidates, choose_model
 from closerange.rig.models import FREE, MODELS, Model, model_named
-from closerange.rig.observations import Observations, join, listed, without_disc_bias
+from closerange.rig.observations import Observations, join, without_disc_bias
 from closerange.rig.outlier_hints import describe_outliers
-from closerange.rig.outliers import ROUNDING_PX, limit
-from closerange.rig.rig import Residuals, Rig
+from closerange.rig.rig import Rig
 from closerange.rig.solution import CameraRefusedError, Solution, solve
 
 
@@ -39,6 +45,7 @@ def calibrate_rig(
     model: str = "auto",
     volume_mm: ArrayLike | None = None,
     reject: bool = True,
+    progress: Callable[[int, int], None] | None = None,
 ) -> Rig:
     """Calibrate the cameras of a rig from points at known world positions.
 
@@ -62,6 +69,8 @@ def calibrate_rig(
         Measuring volume; the bounding box of the control points seen, without it.
     reject : bool, optional
         Leave out blunders.
+    progress : callable, optional
+        Called with (lens models tried, models) while ``auto`` chooses.
 
     Returns
     -------
@@ -84,23 +93,26 @@ def calibrate_rig(
     """
     if model not in MODELS:
         model_named(model)  # raises
-    volume = _checked_volume(volume_mm)
+    volume = checked_volume(volume_mm)
     observations = join(points, control, size_px)
-    solution, xy, choice = _solve(observations, control, model, reject=reject)
+    solution, xy, choice = _solve(observations, control, model, reject=reject, progress=progress)
     covariance = solution.covariance()
     kept = _kept(observations, solution)
     outliers = np.flatnonzero(observations.usable & ~kept).astype(np.int64)
+    _require_in_front(observations, solution.cameras, outliers)
     report = fit_report(observations, solution, covariance)
-    report["disc_bias"] = _bias_report(observations, xy)
+    report["disc_bias"] = bias_report(observations, xy)
     report["outliers"] = describe_outliers(observations, solution.cameras, outliers, xy)
-    report["discordant"] = _discordant(observations, solution, kept, xy)
+    report["discordant"] = discordant(
+        observations, kept, xy, noise_px=solution.noise_px, dof=solution.dof
+    )
     if choice:
         report["model_choice"] = choice
     report["volume"] = "bounding box of the control points" if volume_mm is None else "stated"
-    _warn(report, solution)
+    warn_of(report)
     return Rig(
         cameras=solution.cameras,
-        volume_mm=_bounding_box(observations) if volume is None else volume,
+        volume_mm=bounding_box(observations, outliers) if volume is None else volume,
         parameters=tuple(
             f"{camera.name}.{name}" for camera in solution.cameras for name in solution.model.free
         ),
@@ -108,31 +120,18 @@ def calibrate_rig(
         noise_px=solution.noise_px,
         dof=solution.dof,
         model=solution.model.name,
-        residuals=_residuals(observations, solution, kept, xy),
+        residuals=residual_table(observations, solution.cameras, kept, xy),
         report=report,
     )
 
 
-def _checked_volume(volume_mm: ArrayLike | None) -> FloatArray | None:
-    if volume_mm is None:
-        return None
-    volume = np.asarray(volume_mm, dtype=np.float64)
-    if volume.shape != (2, 3) or not np.isfinite(volume).all():
-        raise InputError(
-            f"the volume has shape {volume.shape}; expected two corners of three numbers, in mm",
-            remedy="give X Y Z of the lower corner, then of the upper one",
-        )
-    if not (volume[0] < volume[1]).all():
-        raise InputError(
-            f"the volume's lower corner {volume[0].tolist()} is not below its upper corner "
-            f"{volume[1].tolist()} on every axis",
-            remedy="give the smaller X, Y, Z first",
-        )
-    return volume
-
-
 def _solve(
-    observations: Observations, control: ControlPoints, model: str, *, reject: bool
+    observations: Observations,
+    control: ControlPoints,
+    model: str,
+    *,
+    reject: bool,
+    progress: Callable[[int, int], None] | None,
 ) -> tuple[Solution, FloatArray, dict[str, Any]]:
     """Find blunders and mistakes, correct disc centres, choose the model if asked to, and fit.
 
@@ -155,7 +154,7 @@ def _solve(
     if (corrected != xy).any():
         xy = corrected
         solution = solve(observations, xy, solution.model, reject=reject, like=solution)
-    choice = _choice(solution) if asked is None else {}
+    choice = _choice(solution, progress) if asked is None else {}
     final = asked or model_named(choice["chosen"])
     if final.name != solution.model.name:
         solution = solve(observations, xy, final, reject=reject, like=solution)
@@ -173,11 +172,11 @@ def _sorting_model(observations: Observations, asked: Model | None) -> Model:
     return richest
 
 
-def _choice(solution: Solution) -> dict[str, Any]:
+def _choice(solution: Solution, progress: Callable[[int, int], None] | None) -> dict[str, Any]:
     if solution.model.name == "dlt":
         return {"chosen": "dlt", "rule": "too few points for a lens model"}
     groups = [part.control_row for part in solution.stated]
-    return choose_model(solution.views, groups, solution.cameras).report
+    return choose_model(solution.views, groups, solution.cameras, progress=progress).report
 
 
 def _look_for_mistakes(
@@ -190,7 +189,7 @@ def _look_for_mistakes(
     bad |= _whole_images(observations, solution)
     for index in np.flatnonzero(bad):
         explain_camera(observations, control, int(index), float(noise[index]))
-        explain_placement(observations, control, int(index), float(noise[index]))
+        explain_placement(observations, control, int(index), solution.clean[index])
 
 
 def _whole_images(observations: Observations, solution: Solution) -> BoolArray:
@@ -212,86 +211,20 @@ def _kept(observations: Observations, solution: Solution) -> BoolArray:
     return kept
 
 
-def _bounding_box(observations: Observations) -> FloatArray:
-    xyz = observations.xyz_mm
-    return np.stack([xyz.min(axis=0), xyz.max(axis=0)])
-
-
-def _residuals(
-    observations: Observations, solution: Solution, kept: BoolArray, xy_px: FloatArray
-) -> Residuals:
-    points = observations.points
-    residual = np.full((len(observations), 2), np.nan)
-    for index, camera in enumerate(solution.cameras):
-        mine = observations.camera == index
-        residual[mine] = xy_px[mine] - camera.project(observations.xyz_mm[mine])
-    flags = points.flags.copy()
-    flags[observations.usable & ~kept] |= int(Flag.outlier)
-    return Residuals(
-        camera=points.camera,
-        placement=points.placement,
-        point=points.point,
-        xyz_mm=observations.xyz_mm,
-        xy_px=xy_px,
-        residual_px=residual,
-        fitted=kept,
-        flags=flags,
-    )
-
-
-def _bias_report(observations: Observations, xy_px: FloatArray) -> dict[str, Any]:
-    shift = np.linalg.norm(observations.points.xy_px - xy_px, axis=1)
-    return {"corrected_points": int(np.count_nonzero(shift)), "largest_px": float(shift.max())}
-
-
-def _discordant(
-    observations: Observations, solution: Solution, kept: BoolArray, xy_px: FloatArray
-) -> list[str]:
-    """List control positions that one camera sees in two places; outliers are listed elsewhere."""
-    found: list[str] = []
-    noise = max(solution.noise_px, ROUNDING_PX)
-    # difference of two points: variance 2 s^2 on each of two coordinates
-    largest = 2 * noise * np.sqrt(limit(solution.dof, max(len(observations), 1)))
-    rows = np.flatnonzero(kept)
-    keys = np.column_stack([observations.camera[rows], observations.xyz_mm[rows]])
-    _, group, count = np.unique(keys, axis=0, return_inverse=True, return_counts=True)
-    for number in np.flatnonzero(count > 1):
-        members: IntArray = rows[group.ravel() == number]
-        spread = np.ptp(xy_px[members], axis=0)
-        if np.hypot(*spread) > largest:
-            names = [
-                f"{observations.points.placement[i]}/{observations.points.point[i]}"
-                for i in members
-            ]
-            camera = observations.points.camera[members[0]]
-            found.append(
-                f"camera {camera!r} sees one position {np.hypot(*spread):.2f} px apart: "
-                f"{listed(names)}"
-            )
-    return found
-
-
-def _warn(report: dict[str, Any], solution: Solution) -> None:
-    texts = list(report["discordant"][:3])
-    outliers = report["outliers"]
-    if outliers:
-        names = [f"{e['camera']}/{e['placement']}/{e['point']}" for e in outliers]
-        hints = list(dict.fromkeys(e["hint"] for e in outliers if e["hint"]))
-        texts.append(
-            f"{len(outliers)} outliers are left out of the fit: {listed(names)}"
-            + (f" ({'; '.join(hints[:3])})" if hints else "")
+def _require_in_front(
+    observations: Observations, cameras: Sequence[Camera], outliers: IntArray
+) -> None:
+    """Refuse control points behind a camera that sees them: they are impossible, not only wrong."""
+    for row in outliers:
+        camera = cameras[observations.camera[row]]
+        depth = float(camera.depth_mm(observations.xyz_mm[row]).item())
+        if depth > 0:
+            continue
+        placement, point = observations.points.placement[row], observations.points.point[row]
+        name = f"{placement}/{point}" if placement else point
+        x, y, z = observations.xyz_mm[row]
+        raise GeometryError(
+            f"control point {name!r} at ({x:g}, {y:g}, {z:g}) mm lies {-depth:.4g} mm behind "
+            f"camera {camera.name!r}, which sees it",
+            remedy="correct its row in the control table",
         )
-    for name, entry in report["cameras"].items():
-        if entry["s_px"] > BAD_PX:
-            texts.append(
-                f"camera {name!r}: the residuals are {entry['s_px']:.2f} px, image points are "
-                f"usually better than {BAD_PX:g} px: does the model {solution.model.name!r} lack "
-                "lens terms, or are control positions wrong?"
-            )
-        if not entry["converged"]:
-            texts.append(
-                f"camera {name!r}: the fit stopped after {entry['iterations']} steps without "
-                f"converging; choose a smaller model than {solution.model.name!r} or add points"
-            )
-    for text in texts:
-        warnings.warn(text, CloseRangeWarning, stacklevel=3)

@@ -15,12 +15,9 @@ from closerange.rig.camera import POSE, Camera
 from closerange.rig.camera_start import affine_starts, square_pixels
 from closerange.rig.distortion import BrownIdeal
 from closerange.rig.dlt import require_spatial, solve_dlt
+from closerange.rig.fit import MAX_CONDITION, Factors, Fit, take_apart
 from closerange.rig.projector import LENS, PARAMETERS, Projector, Values, left_jacobian
 from closerange.rig.view import View, whiten
-
-MAX_CONDITION = 1 / np.sqrt(np.finfo(float).eps)
-"""Largest condition number of the Jacobian with columns of unit length, 6.7e7. A covariance matrix
-carries its square: beyond this limit float64 has no digit left of it."""
 
 START_RATIO = 2.0
 """A fit may leave at most this many times the RMS of the DLT, which has one parameter (skew) more
@@ -42,7 +39,7 @@ Plan = tuple[Camera, Stages]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class CameraFit:
+class CameraFit(Fit):
     """A fitted camera and what the fit knows of itself.
 
     Attributes
@@ -51,52 +48,10 @@ class CameraFit:
         The estimate.
     free : tuple of str
         Names of the estimated parameters.
-    residual_px : ndarray, shape (N, 2)
-        Observed minus calculated.
-    whitened : ndarray, shape (N, 2)
-        The same, divided by the standard deviations; equal to `residual_px` at unit weights.
-    orthonormal : ndarray, shape (N, 2, p)
-        Orthonormal basis Q of the whitened Jacobian's columns; Q Q' is the hat matrix.
-    root : ndarray, shape (p, p)
-        Changes of the parameters by whitened residuals are ``root @ Q' r``.
-    condition : float
-        Condition number of the Jacobian with columns of unit length.
-    iterations : int
-        Steps of all stages.
-    converged : bool
-        False if the search gave up.
     """
 
     camera: Camera
     free: tuple[str, ...]
-    residual_px: FloatArray
-    whitened: FloatArray
-    orthonormal: FloatArray
-    root: FloatArray
-    condition: float
-    iterations: int
-    converged: bool
-
-    @property
-    def rss_px2(self) -> float:
-        """Sum of squared residuals in px^2."""
-        return float(np.sum(self.residual_px**2))
-
-    @property
-    def cofactor(self) -> FloatArray:
-        """inverse(J' W J), shape (p, p): covariance for residuals of unit variance."""
-        matrix: FloatArray = self.root @ self.root.T
-        return matrix
-
-    @property
-    def chi_square(self) -> float:
-        """Sum of squared whitened residuals."""
-        return float(np.sum(self.whitened**2))
-
-    @property
-    def dof(self) -> int:
-        """Numbers minus parameters."""
-        return self.residual_px.size - len(self.free)
 
 
 def fit_camera(
@@ -188,25 +143,17 @@ def analyse(
             remedy="check the pairing of points, or choose a model with fewer lens terms",
         )
     white, jacobian = whiten(view.whitener, residual, columns)
-    matrix = jacobian.reshape(len(free), -1).T
-    scale = np.linalg.norm(matrix, axis=0)
-    scale[scale == 0] = 1.0
-    basis, upper = np.linalg.qr(matrix / scale)
-    turn, singular, vt = np.linalg.svd(upper)
-    condition = float(singular[0] / max(singular[-1], np.finfo(float).tiny))
-    if not condition < MAX_CONDITION:
-        raise _indistinct(view, free, vt[~(singular * MAX_CONDITION > singular[0])], condition)
-    root = (vt.T / singular) / scale[:, None]
-    # rows of the Jacobian are all x, then all y
-    orthonormal = np.moveaxis((basis @ turn).reshape(2, len(view), -1), 0, 1)
+    factors = take_apart(jacobian)
+    if len(factors.indistinct):
+        raise _indistinct(view, free, factors)
     return CameraFit(
         camera=camera,
         free=free,
         residual_px=residual.T,
         whitened=white.T,
-        orthonormal=orthonormal,
-        root=_about_origin(root, free, camera, view),
-        condition=condition,
+        orthonormal=factors.orthonormal,
+        root=_about_origin(factors.root, free, camera, view),
+        condition=factors.condition,
         iterations=iterations,
         converged=converged,
     )
@@ -236,14 +183,12 @@ def _about_origin(
     return moved
 
 
-def _indistinct(
-    view: View, free: tuple[str, ...], directions: FloatArray, condition: float
-) -> GeometryError:
-    share = np.linalg.norm(directions, axis=0)
+def _indistinct(view: View, free: tuple[str, ...], factors: Factors) -> GeometryError:
+    share = np.linalg.norm(factors.indistinct, axis=0)
     names = [free[i] for i in np.argsort(-share) if share[i] > 0.2 * share.max()]
     return GeometryError(
         f"camera {view.name!r}: the points cannot tell {', '.join(names)} apart (condition number "
-        f"{condition:.1e}, the limit is {MAX_CONDITION:.1e})",
+        f"{factors.condition:.1e}, the limit is {MAX_CONDITION:.1e})",
         remedy="add control points at other depths and nearer to the image's edges, or choose a "
         "model with fewer parameters",
     )
@@ -261,6 +206,7 @@ def _descend(
     projector = Projector(view, start)
     lens, rotation, shift = projector.lens, projector.rotation, projector.shift
     lens[[i for i, name in enumerate(LENS) if name not in free]] = 0.0
+    seen, _ = whiten(view.whitener, view.xy_px.T, np.zeros((0, 2, len(view))))
     iterations, converged = 0, False
     for stage in stages:
         function, unpack = _problem(projector, stage, (lens, rotation, shift))
@@ -272,6 +218,7 @@ def _descend(
             step_limit=1e-10 if last else 1e-4,
             # weaker than the weakest direction of a usual rig: less would only slow it down
             damping=1e-5,
+            terms=float(np.sum(seen**2)),
         )
         iterations += fit.iterations
         converged = fit.converged

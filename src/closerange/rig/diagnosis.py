@@ -16,6 +16,7 @@ from closerange.rig.camera_fit import CameraFit, fit_camera
 from closerange.rig.dlt import MIN_POINTS
 from closerange.rig.models import model_named
 from closerange.rig.observations import Observations
+from closerange.rig.outliers import CleanFit
 from closerange.rig.view import View
 
 BAD_PX = 1.0
@@ -98,7 +99,7 @@ def explain_camera(
 
 
 def explain_placement(
-    observations: Observations, control: ControlPoints, camera: int, found_px: float
+    observations: Observations, control: ControlPoints, camera: int, clean: CleanFit
 ) -> None:
     """Look for one placement whose points were named wrongly or went to another camera.
 
@@ -110,8 +111,8 @@ def explain_placement(
         Known positions.
     camera : int
         Index of the camera.
-    found_px : float
-        Its noise as things stand.
+    clean : CleanFit
+        As things stand.
 
     Raises
     ------
@@ -127,8 +128,11 @@ def explain_placement(
         here = np.array([name == placement for name in names])
         if here.all() or not here.any():
             continue
-        rest = _quick_fit(everything.select(~here))
-        if rest is None or np.sqrt(rest.rss_px2 / rest.dof) * EXPLAINS > found_px:
+        if 2 * np.count_nonzero(~clean.kept[here]) > np.count_nonzero(here):
+            rest: CameraFit | None = clean.fit  # has done without the placement already
+        else:
+            rest = _quick_fit(everything.select(~here))
+        if rest is None or np.sqrt(rest.rss_px2 / rest.dof) * EXPLAINS > clean.plain_px:
             continue
         rows = observations.rows(camera)[here]
         before = _median_miss(rest.camera, observations.xyz_mm[rows], observations, rows)
@@ -137,7 +141,8 @@ def explain_placement(
             raise GeometryError(
                 f"camera {everything.name!r}, placement {placement!r}: with {words} in this "
                 f"placement the residual falls from {before:.3g} px to {after:.2g} px",
-                remedy="correct the names in that placement",
+                remedy="correct the names there, and look whether all placements and cameras are "
+                "named rightly",
             )
 
 

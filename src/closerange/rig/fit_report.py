@@ -9,8 +9,8 @@ import numpy as np
 
 from closerange.flags import format_flags
 from closerange.geometry.arrays import FloatArray
-from closerange.rig.camera import POSE
-from closerange.rig.models import LINEAR
+from closerange.rig.camera import POSE, Camera
+from closerange.rig.models import LINEAR, Model
 from closerange.rig.observations import Observations
 from closerange.rig.solution import Solution
 
@@ -63,35 +63,13 @@ def fit_report(
         "noise_px": solution.noise_px,
         "dof": solution.dof,
         "weights": _weights_report(observations, solution),
-        "left_out": _left_out(observations),
+        "left_out": left_out(observations),
         "cameras": cameras,
     }
 
 
 def _camera_report(solution: Solution, index: int, std: FloatArray) -> dict[str, Any]:
     fit, kept = solution.fits[index], solution.clean[index].kept
-    free = {
-        name: {
-            "value": None if name in POSE[:3] else fit.camera.parameter(name),
-            "std": float(std[i]),
-            "unit": _UNITS.get(name, ""),
-            "free": True,
-            "why": "small rotation about the camera's axis, against the estimate"
-            if name in POSE[:3]
-            else "",
-        }
-        for i, name in enumerate(fit.free)
-    }
-    fixed = {
-        name: {
-            "value": 0.0,
-            "std": 0.0,
-            "unit": _UNITS.get(name, ""),
-            "free": False,
-            "why": why,
-        }
-        for name, why in solution.model.fixed.items()
-    }
     return {
         "points": int(np.count_nonzero(kept)),
         "outliers": int(np.count_nonzero(~kept)),
@@ -102,17 +80,54 @@ def _camera_report(solution: Solution, index: int, std: FloatArray) -> dict[str,
         "condition": fit.condition,
         "iterations": fit.iterations,
         "converged": fit.converged,
-        "parameters": {**free, **fixed},
+        "parameters": describe_parameters(fit.camera, solution.model, std),
     }
 
 
+def describe_parameters(camera: Camera, model: Model, std: FloatArray) -> dict[str, Any]:
+    """Describe the free and the fixed parameters of a camera, JSON-ready, by name."""
+    free = {
+        name: {
+            "value": None if name in POSE[:3] else camera.parameter(name),
+            "std": float(std[i]),
+            "unit": _UNITS.get(name, ""),
+            "free": True,
+            "why": "small rotation about the camera's axis, against the estimate"
+            if name in POSE[:3]
+            else "",
+        }
+        for i, name in enumerate(model.free)
+    }
+    fixed = {
+        name: {
+            "value": 0.0,
+            "std": 0.0,
+            "unit": _UNITS.get(name, ""),
+            "free": False,
+            "why": why,
+        }
+        for name, why in model.fixed.items()
+    }
+    return {**free, **fixed}
+
+
 def _weights_report(observations: Observations, solution: Solution) -> dict[str, Any]:
+    linear = solution.model.name in LINEAR
+    words = "unit weights: the method knows no others" if linear else ""
+    chi_square = solution.chi_square / solution.dof if solution.weighted else None
+    return describe_weights(observations, solution.tau_px, chi_square, words)
+
+
+def describe_weights(
+    observations: Observations, tau_px: float, chi_square_per_dof: float | None, words: str = ""
+) -> dict[str, Any]:
+    """Describe how points were weighed, JSON-ready; no chi^2 means unit weights."""
     cov = observations.points.cov_px2[observations.usable]
     known = np.isfinite(cov[:, 0, 0])
-    if solution.model.name in LINEAR:
-        words = "unit weights: the method knows no others"
-    elif not solution.weighted:
-        words = "unit weights: the covariances of all points are not known"
+    if words:
+        pass
+    elif chi_square_per_dof is None:
+        words = "unit weights: neither covariances nor std_mm are stated"
     else:
         words = (
             "inverse of C + tau^2 I + std_mm^2 J J': stated covariances, a common part, and the "
@@ -122,12 +137,12 @@ def _weights_report(observations: Observations, solution: Solution) -> dict[str,
         "rule": words,
         "points_with_covariance": int(np.count_nonzero(known)),
         "points": len(cov),
-        "tau_px": solution.tau_px,
-        "chi_square_per_dof": solution.chi_square / solution.dof if solution.weighted else None,
+        "tau_px": tau_px,
+        "chi_square_per_dof": chi_square_per_dof,
     }
 
 
-def _left_out(observations: Observations) -> dict[str, int]:
+def left_out(observations: Observations) -> dict[str, int]:
     """Count the rows that were kept out before the fit, by their flags."""
     flags = observations.points.flags[~observations.usable]
     return dict(Counter(format_flags(int(flag)) or "check point" for flag in flags))

@@ -7,7 +7,7 @@ the fit itself are never compared: they fall with every parameter, needed or not
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -57,7 +57,11 @@ def candidates(points: int) -> list[Model]:
 
 
 def choose_model(
-    views: Sequence[View], groups: Sequence[IntArray], starts: Sequence[Camera]
+    views: Sequence[View],
+    groups: Sequence[IntArray],
+    starts: Sequence[Camera],
+    *,
+    progress: Callable[[int, int], None] | None = None,
 ) -> Choice:
     """Choose among the affordable models, the same for all cameras.
 
@@ -69,6 +73,8 @@ def choose_model(
         Control position of each point: readings of one position are left out together.
     starts : sequence of Camera
         Any fit of each camera.
+    progress : callable, optional
+        Called with (models tried, models).
 
     Returns
     -------
@@ -81,7 +87,10 @@ def choose_model(
     noise: dict[str, float] = {}
     refused: dict[str, str] = {}
     cameras = list(starts)
-    for model in candidates(min(len(view) for view in views)):
+    models = candidates(min(len(view) for view in views))
+    for number, model in enumerate(models):
+        if progress is not None:
+            progress(number, len(models))
         try:
             fits = [
                 fit_camera(view, model.free, camera)

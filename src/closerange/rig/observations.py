@@ -73,14 +73,25 @@ class Observations:
         """Camera names."""
         return tuple(self.size_px)
 
-    @property
-    def has_cov(self) -> bool:
-        """Whether every usable row has a covariance; with gaps in them none is used."""
-        return bool(np.isfinite(self.points.cov_px2[self.usable]).all())
-
     def rows(self, camera: int) -> IntArray:
         """Return the usable rows of a camera."""
         return np.flatnonzero(self.usable & (self.camera == camera)).astype(np.int64)
+
+    def stated_cov(self, camera: int) -> FloatArray:
+        """Return the covariances of the usable rows of a camera, shape (n, 2, 2).
+
+        A row without one gets the median variance of its camera, or of all cameras where its own
+        states none: a gap must not undo what is known of the other points. Zeros where no row of
+        any camera has one.
+        """
+        variance = np.trace(self.points.cov_px2, axis1=1, axis2=2) / 2
+        known = np.isfinite(variance) & self.usable
+        own = known & (self.camera == camera)
+        cov = self.points.cov_px2[self.rows(camera)].copy()
+        gaps = ~np.isfinite(cov).all(axis=(1, 2))
+        typical = np.median(variance[own if own.any() else known]) if known.any() else 0.0
+        cov[gaps] = typical * np.eye(2)
+        return cov
 
     def view(self, camera: int, xy_px: FloatArray) -> View:
         """Return the usable rows of a camera, with given image positions of all N rows."""

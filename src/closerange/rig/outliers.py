@@ -18,9 +18,7 @@ from closerange.errors import GeometryError
 from closerange.geometry.arrays import BoolArray, FloatArray
 from closerange.rig.camera import Camera
 from closerange.rig.camera_fit import CameraFit, fit_camera, strong_parameters
-from closerange.rig.camera_start import affine_starts
-from closerange.rig.distortion import BrownIdeal
-from closerange.rig.dlt import solve_dlt
+from closerange.rig.fit import Fit
 from closerange.rig.view import View, whiten
 
 FALSE_ALARM = 0.01
@@ -40,24 +38,17 @@ MAX_SHARE = 0.5
 ROUNDING_PX = 1e-6
 """Smallest noise that is told from rounding: exact data have no blunders below it."""
 
-CONSISTENT = 0.7
-"""Share of points explained by a robust fit that makes a second start needless."""
-
-REWEIGHTINGS = 15
+REWEIGHTINGS = 10
 STEPS_PER_REWEIGHTING = 4  # the weights change again before more would pay
 SETTLED = 0.01  # relative change of the variance; the limit above is no finer
 EXCHANGES = 50
 
-SUBSET, SUBSETS = 8, 60
+SUBSET, SUBSETS = 8, 256
 """Points of a subset (six would do, and be worse) and how many are drawn: with one point in ten
-wrong, one subset in two is clean; with one in three, one in twenty-five."""
+wrong, one subset in two is clean; with four in ten, one in sixty."""
 
 FORETOLD = 10.0
 """Standard deviations of the noise to which a point must be predicted to be taken back."""
-
-LONELY = 4.0
-"""Times the median distance from the middle beyond which a point stands alone; the corners of
-blocks, plates and rods reach twice that distance."""
 
 FAR = 10.0
 """Times the median miss of the best subset beyond which a point has no part in the start: lens
@@ -98,7 +89,7 @@ def fit_without_blunders(
     fitter : callable
         The estimator.
     robust_free : tuple of str
-        Parameters of the least-squares fit that sorts the points when blunders hide each other.
+        Parameters of the least-squares fit that sorts the points when the plain fit is suspect.
     trials : int
         Points tested in the whole calibration, over which the false alarm is shared.
 
@@ -106,85 +97,108 @@ def fit_without_blunders(
     -------
     CleanFit
         All points are kept where no blunder is found, or where more than half would be left out.
+
+    Raises
+    ------
+    GeometryError
+        If the points cannot be fitted, with or without blunders.
     """
     everything = np.ones(len(view), dtype=bool)
+    plain, refusal = None, None
     try:
         plain = fitter(view, None)
-    except GeometryError:
-        plain = _without_far_blunders(view, fitter)
-    plain_px = float(np.sqrt(plain.rss_px2 / plain.dof))
-    hidden = _noise(plain) > HIDDEN * _inner_noise(plain.whitened, plain.dof) or _lonely(view)
-    if not hidden and (snoop(plain) <= limit(plain.dof - 2, trials)).all():
-        return CleanFit(plain, everything, plain_px)
-    kept = _sorted_robustly(view, plain, robust_free) if hidden else everything
+        if not _suspect(plain, trials):
+            return CleanFit(plain, everything, _plain_px(plain))
+    except GeometryError as error:
+        refusal = error
     try:
-        fit, kept = _exchange(view, fitter, kept, trials)
+        fit, kept = _exchange(view, fitter, _sorted_robustly(view, robust_free), trials)
     except GeometryError:  # too little is left to carry the parameters
-        return CleanFit(plain, everything, plain_px)
-    if np.count_nonzero(~kept) > MAX_SHARE * len(view):
-        return CleanFit(plain, everything, plain_px)
-    return CleanFit(fit, kept, plain_px)
+        kept = np.zeros(len(view), dtype=bool)
+    if np.count_nonzero(~kept) <= MAX_SHARE * len(view):
+        return CleanFit(fit, kept, np.inf if plain is None else _plain_px(plain))
+    if plain is None:
+        raise refusal or GeometryError(f"camera {view.name!r}: no fit was found")
+    return CleanFit(plain, everything, _plain_px(plain))
 
 
-def _without_far_blunders(view: View, fitter: Fitter) -> CameraFit:
-    """Fit all points, starting from the camera that most of them agree on.
+def _suspect(fit: CameraFit, trials: int) -> bool:
+    """Whether a fit of all points hints at blunders.
 
-    One point ten times too far away spoils the linear start of all the others; the fit that is
-    refused from there is found from a start in which that point has no part.
+    A residual does; so do many that hide each other in a large noise; and so does a far point
+    that drags the fit along until none is left, for it takes a lens that no lens is.
     """
-    agreeing = consensus(view)
-    if agreeing is None or agreeing.all():
-        return fitter(view, None)  # refuses again, with its own reason
-    return fitter(view, fitter(view.select(agreeing), None).camera)
+    hidden = _noise(fit) > HIDDEN * _inner_noise(fit.whitened, fit.dof)
+    return hidden or not fit.converged or bool((snoop(fit) > limit(fit.dof - 2, trials)).any())
 
 
-def _lonely(view: View) -> bool:
-    """Whether a point lies far from the others: it drags the fit along and leaves no residual."""
-    middle = np.median(view.xyz_mm, axis=0)
-    distance = np.linalg.norm(view.xyz_mm - middle, axis=1)
-    return bool(distance.max() > LONELY * np.median(distance))
-
-
-def consensus(view: View) -> BoolArray | None:
-    """Find the points that most others agree with, by the linear solution of small subsets.
+def consensus(view: View) -> BoolArray:
+    """Find the points that most others agree with, by linear solutions of small subsets.
 
     Parameters
     ----------
     view : View
-        Points of one camera; up to a third may be wrong by any amount.
+        Points of one camera; a minority may be wrong by any amount.
 
     Returns
     -------
-    ndarray of bool, shape (N,), or None
+    ndarray of bool, shape (N,)
         Points near the subset's camera whose median miss is the least (Rousseeuw 1984,
-        doi:10.1080/01621459.1984.10477105); None if no subset gives a camera.
+        doi:10.1080/01621459.1984.10477105).
+
+    Raises
+    ------
+    GeometryError
+        If no subset gives a camera.
     """
-    rng = np.random.default_rng(0)
-    best, miss = np.inf, None
-    for _ in range(SUBSETS):
-        rows = rng.choice(len(view), size=min(SUBSET, len(view)), replace=False)
-        try:
-            matrix = solve_dlt(view.xyz_mm[rows], view.xy_px[rows]).matrix
-        except GeometryError:
-            continue
-        image = np.column_stack([view.xyz_mm, np.ones(len(view))]) @ matrix.T
-        with np.errstate(divide="ignore", invalid="ignore"):
-            square = np.sum((image[:, :2] / image[:, 2:] - view.xy_px) ** 2, axis=1)
-        square[~(image[:, 2] > 0)] = np.inf
-        median = float(np.median(square))
-        if median < best:
-            best, miss = median, square
-    if miss is None:
-        return None
-    return np.asarray(miss <= FAR**2 * max(best, ROUNDING_PX**2))
+    world, image = _unit(view.xyz_mm), _unit(view.xy_px)
+    world = np.column_stack([world, np.ones(len(view))])
+    square = _subset_misses(world, image)
+    median = np.median(square, axis=1)
+    best = int(np.argmin(median))
+    if not np.isfinite(median[best]):
+        raise GeometryError(f"camera {view.name!r}: the points do not belong to one view")
+    return np.asarray(square[best] <= FAR**2 * max(median[best], np.finfo(float).eps))
 
 
-def snoop(fit: CameraFit) -> FloatArray:
+def _subset_misses(world: FloatArray, image: FloatArray) -> FloatArray:
+    """Squared misses (S, N) of all points by the cameras of subsets; infinite by no camera.
+
+    The linear equations of `solve_dlt`, for all subsets at once.
+    """
+    count = len(world)
+    rows = np.zeros((count, 2, 12))
+    rows[:, 0, :4] = rows[:, 1, 4:8] = world
+    rows[:, :, 8:] = -image[:, :, None] * world[:, None]
+    order = np.tile(np.arange(count), (SUBSETS, 1))
+    draws = np.random.default_rng(0).permuted(order, axis=1)[:, :SUBSET]
+    equations = rows[draws].reshape(SUBSETS, -1, 12)
+    vectors = np.linalg.eigh(np.swapaxes(equations, 1, 2) @ equations)[1]
+    matrices = vectors[:, :, 0].reshape(SUBSETS, 3, 4)
+    # a camera has its points in front; a mirror image has them behind
+    matrices *= np.sign(np.linalg.det(matrices[:, :, :3]))[:, None, None]
+    seen = matrices @ world.T
+    with np.errstate(divide="ignore", invalid="ignore"):
+        square = np.sum((seen[:, :2] / seen[:, 2:] - image.T) ** 2, axis=1)
+    square[~(seen[:, 2] > 0)] = np.inf
+    square[~np.isfinite(np.take_along_axis(square, draws, axis=1)).all(axis=1)] = np.inf
+    return square
+
+
+def _unit(points: FloatArray) -> FloatArray:
+    """Move points to the origin and scale them to unit size, by medians."""
+    moved = points - np.median(points, axis=0)
+    size = np.median(np.linalg.norm(moved, axis=1))
+    unit: FloatArray = moved / max(float(size), np.finfo(float).tiny)
+    return unit
+
+
+def snoop(fit: Fit) -> FloatArray:
     """Test each fitted point against the others.
 
     Parameters
     ----------
-    fit : CameraFit
+    fit : Fit
         With at least three degrees of freedom.
 
     Returns
@@ -247,7 +261,11 @@ def predicted(fit: CameraFit, view: View) -> FloatArray:
     camera = fit.camera
     residual = view.xy_px - camera.project(view.xyz_mm)
     jacobian = np.moveaxis(camera.parameter_jacobian(view.xyz_mm, fit.free), 0, 2)
-    white, columns = whiten(view.whitener, residual.T, np.swapaxes(jacobian, 0, 1))
+    return foretold(fit, *whiten(view.whitener, residual.T, np.swapaxes(jacobian, 0, 1)))
+
+
+def foretold(fit: Fit, white: FloatArray, columns: FloatArray) -> FloatArray:
+    """Test whitened residuals (2, N) with Jacobian (p, 2, N) of no part in a fit: `predicted`."""
     spread = np.einsum("pin,pq->nqi", columns, fit.root)
     cov = np.eye(2) + np.einsum("nqi,nqj->nij", spread, spread)
     usable = np.isfinite(cov).all(axis=(1, 2)) & np.isfinite(white).all(axis=0)
@@ -285,53 +303,34 @@ def _exchange(
     return fit, kept
 
 
-def _sorted_robustly(view: View, plain: CameraFit, free: tuple[str, ...]) -> BoolArray:
-    """Keep the points that a robust fit explains: the better of two starts."""
-    starts = []
-    agreeing = consensus(view)
-    if agreeing is not None and not agreeing.all():
-        starts.append(fit_camera(view.select(agreeing), free).camera)
-    starts.append(affine_starts(view)[0])
-    if isinstance(plain.camera.distortion, BrownIdeal):
-        starts.append(plain.camera)
-    best = np.inf
-    kept = np.ones(len(view), dtype=bool)
-    for start in starts:
-        try:
-            square = _robust_squares(view, free, start)
-        except GeometryError:
-            continue
-        variance = max(_inner_variance(square, view.xy_px.size - len(free)), ROUNDING_PX**2)
-        if variance < best:
-            best, kept = variance, np.asarray(square <= ROBUST_LIMIT * variance)
-        if np.mean(kept) > CONSISTENT:
-            break
-    return kept
+def _sorted_robustly(view: View, free: tuple[str, ...]) -> BoolArray:
+    """Keep the points that a robust fit explains."""
+    start = fit_camera(view.select(consensus(view)), free).camera
+    square = _robust_squares(view, free, start)
+    variance = max(inner_variance(square, view.xy_px.size - len(free)), ROUNDING_PX**2)
+    return np.asarray(square <= ROBUST_LIMIT * variance)
 
 
 def _robust_squares(view: View, free: tuple[str, ...], start: Camera) -> FloatArray:
     """Squared whitened residuals of a fit by reweighting: Cauchy's weights, then Geman-McClure's.
 
     Cauchy's pull every point a little, so that the search does not stick; the others forget a
-    blunder altogether.
+    blunder altogether. Parameters that could follow a blunder are freed last.
     """
-    camera, early, last = start, REWEIGHTINGS // 3, np.inf
-    square = _squares(view, camera)
-    for step in range(REWEIGHTINGS):
-        stage = strong_parameters(free) if step < early else free
-        variance = max(_inner_variance(square, view.xy_px.size - len(stage)), ROUNDING_PX**2)
-        if not np.isfinite(variance):
-            raise GeometryError(f"camera {view.name!r}: the points do not belong to one view")
-        if step > early + 1 and abs(variance - last) <= SETTLED * last:
-            break
-        last = variance
-        # four variances: a Gaussian residual keeps most of its weight
-        weight = 1 / (1 + square / (4 * variance)) ** (1 if step < early else 2)
-        fit = fit_camera(
-            _reweighted(view, weight), stage, camera, max_iterations=STEPS_PER_REWEIGHTING
-        )
-        camera = fit.camera
-        square = _squares(view, camera)
+    camera, square = start, _squares(view, start)
+    for stage, power in ((free, 2),):
+        last = 0.0
+        for _ in range(REWEIGHTINGS):
+            variance = max(inner_variance(square, view.xy_px.size - len(stage)), ROUNDING_PX**2)
+            if not np.isfinite(variance) or abs(variance - last) <= SETTLED * last:
+                break
+            last = variance
+            # four variances: a Gaussian residual keeps most of its weight
+            weight = 1 / (1 + square / (4 * variance)) ** power
+            seen = np.isfinite(square)  # there is no way down for a point behind the camera
+            points = _reweighted(view, weight).select(seen)
+            camera = fit_camera(points, stage, camera, max_iterations=STEPS_PER_REWEIGHTING).camera
+            square = _squares(view, camera)
     return square
 
 
@@ -348,20 +347,24 @@ def _reweighted(view: View, weight: FloatArray) -> View:
     return view.weighted(unit * root)
 
 
-def _noise(fit: CameraFit) -> float:
+def _noise(fit: Fit) -> float:
     return float(np.sqrt(fit.chi_square / fit.dof))
 
 
+def _plain_px(fit: CameraFit) -> float:
+    return float(np.sqrt(fit.rss_px2 / fit.dof))
+
+
 def _inner_noise(whitened: FloatArray, dof: int) -> float:
-    return float(np.sqrt(_inner_variance(np.sum(whitened**2, axis=1), dof)))
+    return float(np.sqrt(inner_variance(np.sum(whitened**2, axis=1), dof)))
 
 
-def _inner_variance(square: FloatArray, dof: int) -> float:
+def inner_variance(square: FloatArray, dof: int) -> float:
     """Variance of one coordinate by the median: squares of two Gaussians are exponential."""
     return float(np.median(square) / (2 * np.log(2)) * 2 * len(square) / max(dof, 1))
 
 
-def _floor(fit: CameraFit) -> float:
+def _floor(fit: Fit) -> float:
     """Variance of rounding in whitened units."""
     scale = np.sum(fit.whitened**2) / max(np.sum(fit.residual_px**2), np.finfo(float).tiny)
     return float(ROUNDING_PX**2 * (scale if scale > 0 else 1.0))

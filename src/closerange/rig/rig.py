@@ -24,7 +24,8 @@ class Trust:
     verdict : str
         ``good``, ``fair`` or ``untrustworthy``.
     predicted_mm : ndarray, shape (3,)
-        RMS over the volume of the predicted standard deviation of X, Y, Z of one position.
+        RMS over the volume of the predicted standard deviation of X, Y, Z of one position; NaN
+        where there are no positions, as with one camera.
     calibration_mm : ndarray, shape (3,)
         The part of it that comes from the calibration and that averaging cannot remove.
     reasons : tuple of str
@@ -44,6 +45,8 @@ class Trust:
         object.__setattr__(self, "reasons", tuple(self.reasons))
 
     def __str__(self) -> str:
+        if np.isnan(self.predicted_mm).any():
+            return f"{self.verdict}: no positions, hence no predicted error"
         x, y, z = (_micrometres(value) for value in self.predicted_mm)
         return f"{self.verdict}: predicted error {x} (X) {y} (Y) {z} (Z)"
 
@@ -107,7 +110,9 @@ class Rig:
     parameter_cov : ndarray, shape (P, P)
         Their covariance.
     noise_px : float
-        s, the standard deviation of one image coordinate: s^2 = RSS / (n - p).
+        s, the standard deviation of one image coordinate: s^2 = RSS / (n - p), at least 1e-6 px,
+        what rounding hides in exact data. Where control points have a ``std_mm``, their own
+        errors are a part of it.
     dof : int
         n - p, over all cameras.
     model : str

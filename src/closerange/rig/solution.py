@@ -99,8 +99,9 @@ class Solution:
 
     @property
     def noise_px(self) -> float:
-        """S with s^2 = RSS / (n - p)."""
-        return float(np.sqrt(sum(fit.rss_px2 for fit in self.fits) / self.dof))
+        """S with s^2 = RSS / (n - p); of exact data what rounding could hide, never 0."""
+        variance = sum(fit.rss_px2 for fit in self.fits) / self.dof
+        return max(float(np.sqrt(variance)), ROUNDING_PX)
 
     @property
     def chi_square(self) -> float:
@@ -185,9 +186,7 @@ def _stated(observations: Observations, camera: int, model: Model) -> Stated:
     """Collect what is known; the linear methods know no weights."""
     rows = observations.rows(camera)
     linear = model.name in LINEAR
-    cov = observations.points.cov_px2[rows]
-    if linear or not observations.has_cov:
-        cov = np.zeros_like(cov)
+    cov = np.zeros((len(rows), 2, 2)) if linear else observations.stated_cov(camera)
     std = np.zeros(len(rows)) if linear else observations.std_mm[rows]
     return Stated(cov, std, observations.control_row[rows])
 

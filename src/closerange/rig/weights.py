@@ -16,6 +16,7 @@ import numpy as np
 from closerange.geometry.arrays import BoolArray, FloatArray, IntArray
 from closerange.rig.camera import Camera
 from closerange.rig.camera_fit import CameraFit
+from closerange.rig.fit import Fit
 from closerange.rig.view import View, whiten
 
 _HALVINGS = 60  # float64 has 52 binary digits
@@ -145,20 +146,57 @@ def parameter_covariance(
     for fit, view, start in zip(fits, views, offsets, strict=False):
         pull[done : done + len(view), start : start + len(fit.free)] = _pull(fit, view)
         done += len(view)
-    pull *= std[:, None, None]
-    _, group = np.unique(rows, return_inverse=True)
+    return total + shared_errors(pull * std[:, None, None], rows)
+
+
+def shared_errors(pull: FloatArray, control_row: IntArray) -> FloatArray:
+    """Return what it adds to the parameters' covariance that points share a control position.
+
+    Parameters
+    ----------
+    pull : ndarray, shape (N, P, 3)
+        Change of the parameters by one standard deviation of each point's control position,
+        through that point alone.
+    control_row : ndarray of int, shape (N,)
+        Which points share a position.
+
+    Returns
+    -------
+    ndarray, shape (P, P)
+        To be added to a covariance in which each point erred on its own.
+    """
+    _, group = np.unique(control_row, return_inverse=True)
     together = np.zeros((group.max() + 1, *pull.shape[1:]))
     np.add.at(together, group, pull)
-    total += np.tensordot(together, together, axes=([0, 2], [0, 2]))
+    shared: FloatArray = np.tensordot(together, together, axes=([0, 2], [0, 2]))
     # each point's own share is in the cofactor already
-    total -= np.tensordot(pull, pull, axes=([0, 2], [0, 2]))
-    return total
+    return shared - np.tensordot(pull, pull, axes=([0, 2], [0, 2]))
 
 
 def _pull(fit: CameraFit, view: View) -> FloatArray:
     """D parameters / d control mm of each point, shape (N, p, 3)."""
-    by_world = np.moveaxis(fit.camera.project_jacobian(view.xyz_mm), 0, 2)  # (2, 3, N)
-    _, white = whiten(view.whitener, np.zeros((2, len(view))), by_world.swapaxes(0, 1))
+    return pull_of(fit, view.whitener, fit.camera.project_jacobian(view.xyz_mm))
+
+
+def pull_of(fit: Fit, whitener: FloatArray | None, by_point: FloatArray) -> FloatArray:
+    """Return what a displaced point does to the parameters.
+
+    Parameters
+    ----------
+    fit : Fit
+        Of N points.
+    whitener : ndarray, shape (N, 3), or None
+        Its weights.
+    by_point : ndarray, shape (N, 2, 3)
+        D px / d mm of each point.
+
+    Returns
+    -------
+    ndarray, shape (N, P, 3)
+        D parameters / d mm.
+    """
+    columns = np.moveaxis(by_point, 0, 2).swapaxes(0, 1)  # (3, 2, N)
+    _, white = whiten(whitener, np.zeros((2, len(by_point))), columns)
     moment = np.einsum("nip,kin->npk", fit.orthonormal, white)
     pull: FloatArray = np.einsum("qp,npk->nqk", fit.root, moment)
     return pull

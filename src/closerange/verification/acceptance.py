@@ -154,12 +154,12 @@ class Prediction:
     ----------
     noise_share : float
         Share of the predicted variance of one reading that differs between readings; the rest
-        is the calibration's, common to all readings. NaN if unknown.
+        is common to all of them: the calibration, the roughness of the target. NaN if unknown.
     accuracy_ratio : ndarray, shape (4,)
-        rms error of the means / predicted (calibration + noise / M + reference); X, Y, Z, 3-D.
+        rms error of the means / predicted (common part + noise / M + reference); X, Y, Z, 3-D.
     repeatability_ratio : ndarray, shape (4,)
-        Pooled standard deviation / predicted one. Without stated noise the prediction is that
-        of a whole reading: an upper limit, which the ratio should stay below.
+        Pooled standard deviation / that predicted from image noise. Without stated noise the
+        prediction is that of a whole reading: an upper limit, which the ratio should stay below.
     noise_stated : bool
         Whether the covariance of the noise alone was given.
     """

@@ -12,7 +12,11 @@ from closerange.errors import CloseRangeWarning, DataError, InputError
 from closerange.features.control import ControlPoints
 from closerange.flags import Flag
 from closerange.geometry.arrays import FloatArray, IntArray
-from closerange.geometry.covariance import mahalanobis_squared
+from closerange.geometry.covariance import (
+    limited_part,
+    mahalanobis_squared,
+    positive_definite,
+)
 from closerange.position.positions import Positions
 from closerange.verification.acceptance import (
     ACCEPT,
@@ -92,8 +96,9 @@ def single_point_test(
     gauge_std_mm : float, optional
         Standard deviation of the actual positions; replaces the `std_mm` of `truth`.
     noise_cov_mm2 : array_like, shape (M, 3, 3), optional
-        Part of `positions.cov_mm2` that differs between readings. Without it that part is
-        estimated from the readings, as one share of the whole covariance for all positions.
+        Part of `positions.cov_mm2` that differs between readings; replaces
+        `positions.noise_cov_mm2`. Where neither is known for all readings used, that part is
+        estimated from their scatter, as one share of the whole covariance for all positions.
 
     Returns
     -------
@@ -117,7 +122,8 @@ def single_point_test(
             f"none of {len(positions)} readings is usable and has one of {len(truth)} truths",
             remedy="use the same names of placements and points in both tables",
         )
-    groups = _group(positions, known & good, noise_cov_mm2)
+    stated = positions.noise_cov_mm2 if noise_cov_mm2 is None else noise_cov_mm2
+    groups = _group(positions, known & good, stated)
     row = truth.rows_for(*zip(*groups.key, strict=True))
     reference = np.full(len(row), gauge_std_mm) if gauge_std_mm is not None else truth.std_mm[row]
     notes = _Notes(
@@ -142,7 +148,7 @@ class _Notes:
     dof: int | None
 
 
-def _group(positions: Positions, used: NDArray[np.bool_], noise_cov: ArrayLike | None) -> _Groups:
+def _group(positions: Positions, used: NDArray[np.bool_], noise_cov: ArrayLike) -> _Groups:
     rows = positions.select(used)
     keys = list(zip(rows.placement, rows.point, strict=True))
     found = set(keys)
@@ -162,10 +168,7 @@ def _group(positions: Positions, used: NDArray[np.bool_], noise_cov: ArrayLike |
     frozen = (count > 1) & (high == low).all(axis=1)
     flags = np.where(frozen, int(Flag.frozen), 0)
     np.bitwise_or.at(flags, group, rows.flags)
-    noise = None
-    if noise_cov is not None:
-        stated = np.broadcast_to(np.asarray(noise_cov, np.float64), (len(positions), 3, 3))
-        noise = _mean_of(stated[used], group, count)
+    stated = np.broadcast_to(np.asarray(noise_cov, np.float64), (len(positions), 3, 3))[used]
     return _Groups(
         key=tuple(number),
         group=group,
@@ -178,7 +181,7 @@ def _group(positions: Positions, used: NDArray[np.bool_], noise_cov: ArrayLike |
         flags=flags,
         frozen=frozen,
         total=_mean_of(rows.cov_mm2, group, count),
-        noise=noise,
+        noise=_mean_of(stated, group, count) if np.isfinite(stated).all() else None,
     )
 
 
@@ -249,9 +252,7 @@ def _noise_share(groups: _Groups) -> float:
 
 def _scatter_ratio(groups: _Groups) -> float:
     """Return the pooled observed variance relative to the whole predicted one; NaN if unknown."""
-    definite = np.asarray(np.isfinite(groups.total).all(axis=(1, 2)))
-    definite[definite] = np.linalg.eigvalsh(groups.total[definite])[:, 0] > 0
-    kept = definite & (groups.scatter_count > 1)
+    kept = positive_definite(groups.total) & (groups.scatter_count > 1)
     if not kept.any():
         return float("nan")
     square = mahalanobis_squared(groups.deviation, groups.total[groups.group])
@@ -262,7 +263,7 @@ def _predicted_of_mean(groups: _Groups, share: float) -> FloatArray:
     """Predict the covariance of the mean of M readings: only the noise is averaged."""
     averaged = (1 - 1 / groups.count)[:, None, None]
     if groups.noise is not None:
-        return groups.total - averaged * groups.noise
+        return groups.total - averaged * limited_part(groups.noise, groups.total)
     # scatter of one shape with the whole covariance keeps the difference positive definite
     return groups.total * (1 - averaged * (0.0 if np.isnan(share) else share))
 

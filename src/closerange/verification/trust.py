@@ -49,7 +49,7 @@ def judge_rig(rig: Rig, *, volume_given: bool = False) -> Trust:
     total, calibration = _rms(errors.std_mm), _rms(errors.calibration_std_mm)
     grave = [
         *_convergence(rig),
-        *_coverage(rig, errors),
+        *(_coverage(rig, errors) or _undefined(rig, total)),
         *_grave(total, calibration, volume),
     ]
     light = _light(rig, errors, total, calibration)
@@ -59,7 +59,7 @@ def judge_rig(rig: Rig, *, volume_given: bool = False) -> Trust:
 
 def _grave(total: FloatArray, calibration: FloatArray, volume: FloatArray) -> list[str]:
     if not np.isfinite(total).all():
-        return []  # one camera only, or none sees the volume: see `_coverage`
+        return []  # said already by `_light`, `_coverage` or `_undefined`
     reasons = []
     image = np.sqrt(np.maximum(total**2 - calibration**2, 0.0))
     worst = int(np.argmax(calibration / np.maximum(image, 1e-300)))
@@ -93,15 +93,33 @@ def _coverage(rig: Rig, errors: ErrorMap) -> list[str]:
     ]
 
 
+def _undefined(rig: Rig, total: FloatArray) -> list[str]:
+    """Report cameras that all see the volume from one place: their rays never cross."""
+    if len(rig.cameras) < 2 or np.isfinite(total).all():
+        return []
+    centres = np.stack([camera.centre_mm for camera in rig.cameras])
+    apart = float(np.linalg.norm(centres - centres[0], axis=1).max())
+    names = ", ".join(camera.name for camera in rig.cameras)
+    return [
+        (
+            f"no position is defined: the cameras {names} see the volume from places only "
+            f"{apart:.3g} mm apart: are these the images of one camera under several names? Name "
+            "each camera's own images, or move the cameras apart and calibrate again"
+        )
+    ]
+
+
 def _light(rig: Rig, errors: ErrorMap, total: FloatArray, calibration: FloatArray) -> list[str]:
     reasons = []
+    if len(rig.cameras) < 2:
+        reasons.append("one camera: no positions; calibrate a second one that sees the same volume")
     if rig.dof < FEW_DOF:
         reasons.append(
             f"only {rig.dof} degrees of freedom: the prediction itself is uncertain by "
             f"{100 * np.sqrt(0.5 / max(rig.dof, 1)):.0f} %; add control points"
         )
     unseen = float(np.mean(~np.isfinite(errors.std_mm).all(axis=1)))
-    if unseen > 0.5:
+    if np.isfinite(total).all() and unseen > 0.5:
         reasons.append(
             f"{100 * unseen:.0f} % of the volume is seen by fewer than two cameras: "
             "turn the cameras, or state a smaller --volume"

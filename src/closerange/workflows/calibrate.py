@@ -2,23 +2,24 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+import warnings
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from closerange.errors import UntrustedError
+from closerange.errors import CloseRangeWarning, UntrustedError
 from closerange.features.control import ControlPoints, read_control
 from closerange.features.image_points import ImagePoints
 from closerange.features.points_table import read_points
-from closerange.files import sha256
 from closerange.rig.calibrate import calibrate_rig
 from closerange.rig.free_poses import calibrate_free_poses
 from closerange.rig.rig import Rig
+from closerange.verification.travel import travel_hints
 from closerange.verification.trust import judge_rig
-from closerange.version import __version__
+from closerange.workflows.inputs import input_hashes, versions
 
 Tables = ImagePoints | Path | str | Sequence[Path | str]
 
@@ -32,6 +33,7 @@ def calibrate(
     volume_mm: ArrayLike | None = None,
     free_poses: bool = False,
     accept_untrusted: bool = False,
+    progress: Callable[[int, int], None] | None = None,
 ) -> Rig:
     """Calibrate cameras to the world frame of known points.
 
@@ -55,6 +57,8 @@ def calibrate(
         target's frame in the first placement.
     accept_untrusted : bool, optional
         Return an untrustworthy rig, marked so, instead of raising.
+    progress : callable, optional
+        Called with (lens models tried, models).
 
     Returns
     -------
@@ -69,22 +73,30 @@ def calibrate(
         If the points cannot carry a calibration at all.
     UntrustedError
         If the rig must not be believed, with the predicted error in mm and what to do.
+
+    Warns
+    -----
+    CloseRangeWarning
+        As `calibrate_rig`, and of control points that a device seems to have misplaced.
     """
     named = points, control
     if not isinstance(points, ImagePoints):
         points = read_points(*([points] if isinstance(points, (str, Path)) else points))
     if not isinstance(control, ControlPoints):
         control = read_control(control)
-    inputs = _hashes(*named)  # after the readers, which refuse devices and pipes
+    inputs = input_hashes(_files(*named))  # after the readers, which refuse devices and pipes
     sizes = {**points.size_px, **(image_size or {})}
     volume = None if volume_mm is None else np.reshape(np.asarray(volume_mm, np.float64), (2, 3))
     if free_poses:
         rig = calibrate_free_poses(points, control, sizes, model=model)
     else:
-        rig = calibrate_rig(points, control, sizes, model=model, volume_mm=volume)
+        rig = calibrate_rig(
+            points, control, sizes, model=model, volume_mm=volume, progress=progress
+        )
+        rig = _with_travel_hints(rig)
     trust = judge_rig(rig, volume_given=volume is not None)
     options = {"model": model, "volume_mm": None if volume is None else volume.tolist()}
-    provenance = {"program": f"closerange {__version__}", "options": options, "inputs": inputs}
+    provenance = {**versions(), "options": options, "inputs": inputs}
     rig = replace(rig, trust=trust, provenance={**rig.provenance, **provenance})
     if not rig.trusted and not accept_untrusted:
         raise UntrustedError(
@@ -94,8 +106,16 @@ def calibrate(
     return rig
 
 
-def _hashes(points: Tables, control: ControlPoints | Path | str) -> dict[str, str]:
-    """Return SHA-256 by file name of all inputs that are files."""
+def _with_travel_hints(rig: Rig) -> Rig:
+    """Warn of regular errors of the device that positioned the control points."""
+    hints = travel_hints(rig)
+    for hint in hints:
+        warnings.warn(hint, CloseRangeWarning, stacklevel=3)
+    return replace(rig, report={**rig.report, "travel": hints}) if hints else rig
+
+
+def _files(points: Tables, control: ControlPoints | Path | str) -> list[Path | str]:
+    """List those inputs that are files."""
     files: list[Path | str] = []
     if isinstance(points, (str, Path)):
         files.append(points)
@@ -103,4 +123,4 @@ def _hashes(points: Tables, control: ControlPoints | Path | str) -> dict[str, st
         files.extend(points)
     if isinstance(control, (str, Path)):
         files.append(control)
-    return {Path(file).name: sha256(file) for file in files}
+    return files

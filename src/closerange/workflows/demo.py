@@ -18,7 +18,7 @@ def demo(
     Parameters
     ----------
     output : Path or str, optional
-        Folder of the results.
+        Folder of the results; its folder ``inputs`` gets the images, targets and tables.
     overwrite : bool, optional
         Replace an existing folder of results.
     announce : callable, optional
@@ -36,5 +36,9 @@ def demo(
     """
     with as_file(files("closerange.workflows") / "demo_data") as folder:
         return run(
-            folder / "closerange.toml", output=output, overwrite=overwrite, announce=announce
+            folder / "closerange.toml",
+            output=output,
+            overwrite=overwrite,
+            keep_inputs=True,
+            announce=announce,
         )

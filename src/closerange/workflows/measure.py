@@ -7,6 +7,7 @@ from pathlib import Path
 
 from closerange.features.image_points import ImagePoints
 from closerange.features.points_table import read_points
+from closerange.matching.correspondences import Correspondences
 from closerange.position.measure import measure_points
 from closerange.position.positions import Positions
 from closerange.rig.rig import Rig
@@ -14,7 +15,8 @@ from closerange.rig.rig_file import read_rig
 
 
 def measure(
-    rig: Rig | Path | str, points: ImagePoints | Path | str | Sequence[Path | str]
+    rig: Rig | Path | str,
+    points: ImagePoints | Correspondences | Path | str | Sequence[Path | str],
 ) -> Positions:
     """Measure world positions of points that two or more cameras see.
 
@@ -22,8 +24,8 @@ def measure(
     ----------
     rig : Rig or path
         Calibrated cameras, or their file.
-    points : ImagePoints, path or sequence of paths
-        Image points, or their tables.
+    points : ImagePoints, Correspondences, path or sequence of paths
+        Image points, matches, or their tables.
 
     Returns
     -------
@@ -37,6 +39,8 @@ def measure(
     """
     if not isinstance(rig, Rig):
         rig = read_rig(rig)
-    if not isinstance(points, ImagePoints):
+    if isinstance(points, Correspondences):
+        points = points.to_image_points()
+    elif not isinstance(points, ImagePoints):
         points = read_points(*([points] if isinstance(points, (str, Path)) else points))
     return measure_points(rig, points)

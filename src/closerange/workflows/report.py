@@ -16,6 +16,7 @@ from closerange.rig.rig_schema import SCHEMA as RIG_SCHEMA
 from closerange.verification.error_map import ErrorMap, judged_volume, predict_errors
 from closerange.verification.result_file import SCHEMA as RESULT_SCHEMA
 from closerange.verification.result_file import read_result
+from closerange.workflows.run_tables import read_tables
 
 RUN_SCHEMA = "closerange.run/1"
 
@@ -32,7 +33,8 @@ def report(source: Path | str) -> str:
     Parameters
     ----------
     source : Path or str
-        A rig file, a verification result, or the ``run.json`` of a project.
+        A rig file, a verification result, or the ``run.json`` of a project, with its
+        tables beside it.
 
     Returns
     -------
@@ -53,7 +55,7 @@ def report(source: Path | str) -> str:
     if schema == RESULT_SCHEMA:
         return report_of_result(read_result(source))
     if schema == RUN_SCHEMA:
-        return report_of_run(document, source=str(source))
+        return report_of_run(document, folder=Path(source).parent, source=str(source))
     raise SchemaError(
         f"{source}: schema is {schema!r}; no stored result",
         remedy="name a rig file, a verification result or a run.json",
@@ -79,15 +81,39 @@ def report_of_result(document: Mapping[str, Any]) -> str:
     )
 
 
-def report_of_run(document: Mapping[str, Any], *, source: str) -> str:
-    """Render what a project gave, from its ``run.json``."""
+def report_of_run(document: Mapping[str, Any], *, folder: Path, source: str) -> str:
+    """Render what a project gave, from its ``run.json`` and the tables beside it.
+
+    Parameters
+    ----------
+    document : mapping
+        Contents of the ``run.json``.
+    folder : Path
+        Where it lies.
+    source : str
+        Its name for messages.
+
+    Returns
+    -------
+    str
+        HTML.
+
+    Raises
+    ------
+    FileError
+        If a table is missing, or was changed since the run.
+    SchemaError
+        If it is not a complete run.
+    """
     try:
         rig = rig_from_document(document["rig"], source=source)
-        overlays = [Overlay.from_document(entry) for entry in document["overlays"]]
+        points, positions = read_tables(document["tables"], folder, source=source)
         return render_report(
             title=document["title"],
             rig=rig,
-            overlays=overlays,
+            points=points,
+            overlays=[Overlay.from_document(entry) for entry in document["overlays"]],
+            positions=positions,
             checks=document["results"],
             error_map=error_map_of(rig),
             provenance=document["provenance"],

@@ -2,44 +2,49 @@
 
 from __future__ import annotations
 
-import tempfile
+import os
 import time
 import warnings
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 from closerange.delivery.overlays import Overlay, make_overlay
 from closerange.errors import CloseRangeWarning, FileError
 from closerange.features.image_points import ImagePoints
-from closerange.features.points_table import write_points
 from closerange.files import dump_json, sha256, write_text
 from closerange.images import (
     check_duplicates,
+    check_exposures,
     group_images,
     natural_key,
     placement_and_reading,
+    read_exposures,
     read_image,
 )
 from closerange.position.positions import Positions
-from closerange.position.positions_table import write_positions
 from closerange.rig.rig import Rig
 from closerange.rig.rig_file import rig_to_document, write_rig
 from closerange.settings import Detection, Job, Settings, images_of, inside, read_settings
 from closerange.verification.result_file import write_result
-from closerange.version import __version__
 from closerange.workflows.calibrate import calibrate
-from closerange.workflows.detect import detect
+from closerange.workflows.detect import detect, read_crops
+from closerange.workflows.inputs import copy_inputs, versions
 from closerange.workflows.measure import measure
-from closerange.workflows.report import RUN_SCHEMA, report_of_run
+from closerange.workflows.report import RUN_SCHEMA, report
+from closerange.workflows.result_folder import check_free, put
+from closerange.workflows.run_tables import CALIBRATION, write_tables
 from closerange.workflows.verify import Result, verify
 
 Announce = Callable[[str, int, int], None]
 """Called with (what is being done, done, total)."""
 
 MAX_OVERLAYS = 20
-"""Pictures in a report: of more images the first ones are shown."""
+"""Pictures of the calibration in a report: of more images the first ones are shown."""
+
+JOB_OVERLAYS = 2
+"""Pictures of each camera and job: enough to see what was measured, and how well it was seen."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -74,6 +79,8 @@ class RunResult:
         Where the files are: rig.json, points and positions tables, results, report.html.
     rig : Rig
         The calibrated cameras.
+    points : ImagePoints
+        What they were calibrated from.
     jobs : tuple of JobResult
         In the order of the project file.
     warnings : tuple of str
@@ -84,6 +91,7 @@ class RunResult:
 
     folder: Path
     rig: Rig
+    points: ImagePoints
     jobs: tuple[JobResult, ...]
     warnings: tuple[str, ...]
     calibration_s: float
@@ -99,6 +107,7 @@ def run(
     *,
     output: Path | str | None = None,
     overwrite: bool = False,
+    keep_inputs: bool = False,
     announce: Announce | None = None,
 ) -> RunResult:
     """Run a project: detect, calibrate, measure, verify, report.
@@ -111,6 +120,8 @@ def run(
         Folder of the results instead of the one that the project names.
     overwrite : bool, optional
         Replace an existing folder of results.
+    keep_inputs : bool, optional
+        Copy all inputs into the folder ``inputs`` of the results.
     announce : callable, optional
         Called with (what is being done, done, total).
 
@@ -126,69 +137,29 @@ def run(
     """
     settings = read_settings(project)
     folder = Path(output) if output is not None else inside(settings, settings.outputs.folder)
-    _check_free(folder, Path(project), overwrite=overwrite)
+    check_free(folder, Path(project), overwrite=overwrite)
     _check_named_files(settings)
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always", CloseRangeWarning)
         result, overlays = _measure_all(settings, folder, announce)
-    notes = tuple(dict.fromkeys(str(entry.message) for entry in caught))
-    result = RunResult(folder, result.rig, result.jobs, notes, result.calibration_s)
+    notes = tuple(dict.fromkeys(_relative(str(entry.message), settings) for entry in caught))
+    result = replace(result, warnings=notes)
     hashes = _hashes(settings, Path(project))
-    _put(folder, lambda staged: _write_all(staged, settings, result, overlays, hashes))
+
+    def fill(staged: Path) -> None:
+        _write_all(staged, settings, result, overlays, hashes)
+        if keep_inputs:
+            copy_inputs(hashes, settings.folder, staged / "inputs")
+
+    put(folder, fill)
     return result
-
-
-def _put(folder: Path, write: Callable[[Path], None]) -> None:
-    """Fill a folder aside and rename it: an interruption leaves the old one, or none."""
-    target = folder.resolve()
-    try:
-        target.parent.mkdir(parents=True, exist_ok=True)
-        with tempfile.TemporaryDirectory(prefix=f".{target.name}.", dir=target.parent) as aside:
-            staged, old = Path(aside) / "new", Path(aside) / "old"
-            staged.mkdir()
-            write(staged)
-            if target.exists():
-                target.replace(old)
-            try:
-                staged.replace(target)
-            except BaseException:
-                if old.exists():
-                    old.replace(target)
-                raise
-    except OSError as error:
-        raise FileError(
-            f"{folder}: cannot be written ({error.strerror or error})",
-            remedy="check that the place is writable and has room",
-        ) from error
-
-
-def _check_free(folder: Path, project: Path, *, overwrite: bool) -> None:
-    place = folder.resolve()
-    nearest = next(part for part in (place, *place.parents) if part.exists())
-    if not nearest.is_dir():
-        raise FileError(f"{nearest}: is a file", remedy="name a folder")
-    if project.resolve().is_relative_to(place):
-        raise FileError(
-            f"{folder}: the project lies in it, results replace their whole folder",
-            remedy="name a folder of their own",
-        )
-    if folder.is_dir() and any(folder.iterdir()) and not overwrite:
-        raise FileError(
-            f"{folder}: the folder exists and is not empty",
-            remedy="name another one, or allow to replace it with --overwrite",
-        )
-    if folder.is_dir() and any(folder.iterdir()) and not (folder / "run.json").is_file():
-        raise FileError(
-            f"{folder}: not a folder of results (no run.json in it); it is left alone",
-            remedy="name another folder",
-        )
 
 
 def _measure_all(
     settings: Settings, folder: Path, announce: Announce | None
 ) -> tuple[RunResult, list[Overlay]]:
     said = announce or (lambda _what, _done, _total: None)
-    points = _detect_all(settings, settings.calibration, "calibration", said)
+    points = _detect_all(settings, settings.calibration, CALIBRATION, said)
     said("calibrating", 0, 1)
     start = time.perf_counter()
     calibration = settings.calibration
@@ -198,15 +169,16 @@ def _measure_all(
         model=calibration.model,
         volume_mm=calibration.volume_mm,
         accept_untrusted=calibration.accept_untrusted,
+        progress=lambda done, total: said("calibrating", done, total),
     )
     elapsed = time.perf_counter() - start
     said("calibrating", 1, 1)
     jobs = tuple(_run_job(settings, job, rig, said) for job in settings.job)
-    overlays = _overlays(settings, calibration, points, rig)
+    overlays = _overlays(settings, calibration, points, rig, most=MAX_OVERLAYS)
     for job, done in zip(settings.job, jobs, strict=True):
-        if len(overlays) < MAX_OVERLAYS and job.crops is None:
-            overlays += _overlays(settings, job, done.points, None)
-    return RunResult(folder, rig, jobs, (), elapsed), overlays[:MAX_OVERLAYS]
+        most = JOB_OVERLAYS * len(job.images)
+        overlays += _overlays(settings, job, done.points, None, most=most)
+    return RunResult(folder, rig, points, jobs, (), elapsed), overlays
 
 
 def _run_job(settings: Settings, job: Job, rig: Rig, said: Announce) -> JobResult:
@@ -223,6 +195,12 @@ def _detect_all(settings: Settings, detection: Detection, what: str, said: Annou
     """Detect in the images of all cameras, after checking that they belong together."""
     paths = {name: images_of(settings, listed) for name, listed in detection.images.items()}
     sets = group_images(paths, pattern=detection.placement_pattern)
+    if detection.times is not None and detection.time_tolerance_s is not None:
+        check_exposures(
+            ((camera, one.placement, one.reading) for one in sets for camera in one.paths),
+            read_exposures(inside(settings, detection.times)),
+            tolerance_s=detection.time_tolerance_s,
+        )
     check_duplicates(
         read_image(path, camera=camera) for one in sets for camera, path in one.paths.items()
     )
@@ -252,28 +230,48 @@ def _offset_progress(
 
 
 def _overlays(
-    settings: Settings, detection: Detection, points: ImagePoints, rig: Rig | None
+    settings: Settings,
+    detection: Detection,
+    points: ImagePoints,
+    rig: Rig | None,
+    *,
+    most: int,
 ) -> list[Overlay]:
+    """Draw on at most so many images, the same number of each camera."""
+    each = max(1, most // len(detection.images))
+    crops = None if detection.crops is None else read_crops(inside(settings, detection.crops))
     overlays = []
     for camera, patterns in detection.images.items():
-        for path in sorted(images_of(settings, patterns), key=lambda file: natural_key(file.name)):
-            placement, reading = placement_and_reading(path, detection.placement_pattern)
-            if reading:
-                continue
-            overlays.append(
-                make_overlay(
-                    read_image(path, camera=camera),
-                    points,
-                    placement=placement,
-                    residuals=None if rig is None else rig.residuals,
-                )
+        paths = sorted(images_of(settings, patterns), key=lambda file: natural_key(file.name))
+        named = [
+            (path, *placement_and_reading(path, detection.placement_pattern)) for path in paths
+        ]
+        # of repeated readings, whose pictures look alike, the first
+        firsts = {placement: (path, reading) for path, placement, reading in reversed(named)}
+        for placement in list(dict.fromkeys(placement for _, placement, _ in named))[:each]:
+            path, reading = firsts[placement]
+            frame = read_image(path, camera=camera)
+            overlay = make_overlay(
+                replace(frame, source=path.relative_to(settings.folder).as_posix()),
+                points,
+                placement=placement,
+                reading=reading,
+                residuals=None if rig is None else rig.residuals,
             )
+            if crops is not None:
+                overlay = replace(overlay, xy_px=overlay.xy_px - crops[path.name])
+            overlays.append(overlay)
     return overlays
+
+
+def _relative(text: str, settings: Settings) -> str:
+    """Leave the project's folder out of a message: it belongs to the machine."""
+    return text.replace(f"{settings.folder}{os.sep}", "")
 
 
 def _named_files(settings: Settings) -> list[str]:
     """List the tables and targets that the project names, as they are written there."""
-    keys = ("target", "crops", "control", "truth")
+    keys = ("target", "crops", "times", "control", "truth")
     parts = (settings.calibration, *settings.job)
     return [name for part in parts for key in keys if (name := getattr(part, key, None))]
 
@@ -303,23 +301,28 @@ def _write_all(
     overlays: list[Overlay],
     hashes: dict[str, str],
 ) -> None:
+    """Write rig, tables, results, the record of the run and the report that is made from it."""
     write_rig(result.rig, folder / "rig.json")
-    documents: list[dict[str, Any]] = []
+    tables = write_tables(
+        folder,
+        {CALIBRATION: result.points, **{job.name: job.points for job in result.jobs}},
+        {job.name: job.positions for job in result.jobs},
+    )
+    results: list[dict[str, Any]] = []
     for job in result.jobs:
-        stem = job.name.replace(" ", "-")
-        write_points(job.points, folder / f"{stem}-points.csv")
-        write_positions(job.positions, folder / f"{stem}-positions.csv")
         if job.result is not None:
-            write_result(job.result, folder / f"{stem}-result.json")
-            documents.append({"job": job.name, **job.result.to_document()})
+            write_result(job.result, folder / f"{job.name.replace(' ', '-')}-result.json")
+            results.append({"job": job.name, **job.result.to_document()})
     document = {
         "schema": RUN_SCHEMA,
         "title": settings.title,
         "rig": rig_to_document(result.rig),
-        "results": documents,
+        "tables": tables,
+        "results": results,
         "overlays": [overlay.to_document() for overlay in overlays],
         "warnings": list(result.warnings),
-        "provenance": {"program": f"closerange {__version__}", "inputs": hashes},
+        "provenance": {**versions(), "inputs": hashes},
     }
     dump_json(document, folder / "run.json")
-    write_text(folder / "report.html", report_of_run(document, source="run.json"))
+    # made from the files, not from memory: `closerange report` gives the same again
+    write_text(folder / "report.html", report(folder / "run.json"))

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import warnings
 from pathlib import Path
 
-from closerange.errors import InputError
+from closerange.errors import CloseRangeWarning, InputError
 from closerange.features.control import ControlPoints, read_control
 from closerange.position.positions import Positions
 from closerange.position.positions_table import read_positions
@@ -14,6 +15,7 @@ from closerange.verification.acceptance import AcceptanceReport, Limits
 from closerange.verification.control_check import ControlCheck, compare_with_control
 from closerange.verification.lengths import LengthCheck, Lengths, length_test, read_lengths
 from closerange.verification.single_point import single_point_test
+from closerange.verification.travel import truth_hints
 
 KINDS = ("control", "single-point", "lengths")
 
@@ -58,17 +60,26 @@ def verify(
         If a file, the kind or the truth cannot be used.
     DataError
         If no measured position has a truth.
+
+    Warns
+    -----
+    CloseRangeWarning
+        Of differences so regular that a scale, a lost turn or one placement explains them.
     """
+    if kind not in KINDS:
+        raise InputError(
+            f"kind {kind!r} of verification", remedy=f"known kinds are {', '.join(KINDS)}"
+        )
     if not isinstance(positions, Positions):
         positions = read_positions(positions)
     if kind == "lengths":
         return length_test(positions, _lengths(truth))
     control = _control(truth)
+    for hint in truth_hints(positions, control):
+        warnings.warn(hint, CloseRangeWarning, stacklevel=2)
     if kind == "single-point":
         return single_point_test(positions, control, limits=limits, cycle_time_s=cycle_time_s)
-    if kind == "control":
-        return _control_check(positions, control, rig)
-    raise InputError(f"kind {kind!r} of verification", remedy=f"known kinds are {', '.join(KINDS)}")
+    return _control_check(positions, control, rig)
 
 
 def _control_check(

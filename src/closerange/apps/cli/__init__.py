@@ -1,6 +1,9 @@
 """The command line: parses, calls a workflow, prints; nothing else."""
 
+from closerange.apps.cli import shapes
 from closerange.apps.cli.commands import app
+
+app.add_typer(shapes.app)
 
 
 def main() -> None:

@@ -3,19 +3,28 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from closerange.apps.cli import options
-from closerange.apps.cli.console import Progress, print_json, say, verb
+from closerange.apps.cli.console import Outcome, keep, verb
+from closerange.apps.cli.examples import epilog
+from closerange.apps.cli.outputs import check_outputs
+from closerange.apps.cli.progress import Progress
+from closerange.apps.cli.usage import Verbs
+from closerange.errors import DataError
 from closerange.version import __version__
+
+if TYPE_CHECKING:
+    from closerange.workflows.run import RunResult
 
 app = typer.Typer(
     name="closerange",
+    cls=Verbs,
     help="Close-range 3-D position sensing with two or more ordinary cameras placed anywhere.\n\n"
     "Begin with: closerange demo",
-    no_args_is_help=True,
+    invoke_without_command=True,
     add_completion=False,
     rich_markup_mode=None,
     pretty_exceptions_enable=False,
@@ -31,15 +40,18 @@ def _version(asked: bool) -> None:
 
 @app.callback()
 def _root(
+    context: typer.Context,
     _: Annotated[
         bool, typer.Option("--version", callback=_version, is_eager=True, help="Print the version.")
     ] = False,
 ) -> None:
     """Close-range 3-D position sensing with two or more ordinary cameras placed anywhere."""
+    if context.invoked_subcommand is None:
+        typer.echo(context.get_help())
+        raise typer.Exit(2)  # nothing was asked for, nothing is done
 
 
-@app.command(epilog="Example: closerange detect left_*.png --target plate.toml --camera left "
-             "--placement-pattern '_(z.*)$' -o left.csv")  # fmt: skip
+@app.command(epilog=epilog("detect"))
 @verb
 def detect(
     images: Annotated[list[str], typer.Argument(metavar="IMAGE...", help="Images or folders.")],
@@ -66,13 +78,14 @@ def detect(
             metavar="CROPS.csv", help="image, x0_px, y0_px of images cut out of larger ones."
         ),
     ] = None,
-    json_output: options.Json = False,
-) -> int:
+    _json: options.Json = False,
+) -> Outcome:
     """Find a target in the images of one camera; several images are several placements."""
     from closerange.apps.cli.screens import points_summary, points_text
     from closerange.features.points_table import write_points
     from closerange.workflows.detect import detect as work
 
+    check_outputs([output], [*images, target, crops])
     with Progress() as progress:
         points = work(
             images, target=target, camera=camera, placement=placement,
@@ -80,14 +93,11 @@ def detect(
             progress=progress.step("detecting"),
         )  # fmt: skip
     write_points(points, output)
-    say(points_text(points, output), json_output=json_output)
-    if json_output:
-        print_json(points_summary(points, output))
-    return 0 if (points.flags == 0).any() else 1
+    failure = None if (points.flags == 0).any() else _all_flagged(len(points), output)
+    return Outcome(points_text(points, output), points_summary(points, output), failure=failure)
 
 
-@app.command(epilog="Example: closerange calibrate left.csv right.csv --control control.csv "
-             "--image-size left=640x512 --image-size right=640x512 -o rig.json")  # fmt: skip
+@app.command(epilog=epilog("calibrate"))
 @verb
 def calibrate(
     points: Annotated[list[Path], typer.Argument(metavar="POINTS.csv...", help="Points tables.")],
@@ -113,9 +123,11 @@ def calibrate(
     accept_untrusted: Annotated[
         bool, typer.Option("--accept-untrusted", help="Write an untrustworthy rig, marked so.")
     ] = False,
+    times: options.Times = None,
+    time_tolerance: options.TimeTolerance = None,
     report: options.Report = None,
-    json_output: options.Json = False,
-) -> int:
+    _json: options.Json = False,
+) -> Outcome:
     """Calibrate cameras to the world frame of known points."""
     from closerange.apps.cli.screens import rig_summary, rig_text
     from closerange.files import write_text
@@ -123,42 +135,48 @@ def calibrate(
     from closerange.workflows.calibrate import calibrate as work
     from closerange.workflows.report import report_of_rig
 
-    rig = work(
-        points, control=control, image_size=options.image_sizes(image_size), model=model,
-        volume_mm=volume, free_poses=free_poses, accept_untrusted=accept_untrusted,
-    )  # fmt: skip
+    check_outputs([output, report], [*points, control, times])
+    options.check_times(points, times, time_tolerance)
+    with Progress("calibrating") as progress:
+        rig = work(
+            points, control=control, image_size=options.image_sizes(image_size), model=model,
+            volume_mm=volume, free_poses=free_poses, accept_untrusted=accept_untrusted,
+            progress=progress.step("calibrating"),
+        )  # fmt: skip
+        page = None if report is None else report_of_rig(rig)
     write_rig(rig, output)
-    if report is not None:
-        write_text(report, report_of_rig(rig))
-    say(rig_text(rig, output, report), json_output=json_output)
-    if json_output:
-        print_json(rig_summary(rig, output))
-    return 0
+    keep(output)
+    if report is not None and page is not None:
+        write_text(report, page)
+    return Outcome(rig_text(rig, output, report), rig_summary(rig, output))
 
 
-@app.command(epilog="Example: closerange measure rig.json left.csv right.csv -o positions.csv")
+@app.command(epilog=epilog("measure"))
 @verb
 def measure(
     rig: Annotated[Path, typer.Argument(metavar="RIG.json", help="Calibrated cameras.")],
     points: Annotated[list[Path], typer.Argument(metavar="POINTS.csv...", help="Points tables.")],
     output: Annotated[Path, options.output("positions.csv")],
-    json_output: options.Json = False,
-) -> int:
+    times: options.Times = None,
+    time_tolerance: options.TimeTolerance = None,
+    _json: options.Json = False,
+) -> Outcome:
     """Measure world positions of points that two or more cameras see."""
     from closerange.apps.cli.screens import positions_summary, positions_text
     from closerange.position.positions_table import write_positions
     from closerange.workflows.measure import measure as work
 
-    positions = work(rig, points)
-    write_positions(positions, output)
-    say(positions_text(positions, output), json_output=json_output)
-    if json_output:
-        print_json(positions_summary(positions, output))
-    return 0 if (positions.flags == 0).any() else 1
+    check_outputs([output], [rig, *points, times])
+    options.check_times(points, times, time_tolerance)
+    with Progress("measuring"):
+        positions = work(rig, points)
+        write_positions(positions, output)
+    failure = None if (positions.flags == 0).any() else _all_flagged(len(positions), output)
+    text, summary = positions_text(positions, output), positions_summary(positions, output)
+    return Outcome(text, summary, failure=failure)
 
 
-@app.command(epilog="Example: closerange verify single-point positions.csv --truth truth.csv "
-             "-o result.json --report report.html")  # fmt: skip
+@app.command(epilog=epilog("verify"))
 @verb
 def verify(
     kind: Annotated[str, typer.Argument(metavar="KIND", help="control, single-point or lengths.")],
@@ -183,31 +201,32 @@ def verify(
         float | None, typer.Option(metavar="SECONDS", help="Time from command to result.")
     ] = None,
     report: options.Report = None,
-    json_output: options.Json = False,
-) -> int:
+    _json: options.Json = False,
+) -> Outcome:
     """Compare positions with a known truth."""
     from closerange.apps.cli.screens import result_summary, result_text
-    from closerange.files import sha256, write_text
+    from closerange.files import write_text
     from closerange.verification.result_file import read_result, write_result
+    from closerange.workflows.inputs import input_hashes, versions
     from closerange.workflows.report import report_of_result
     from closerange.workflows.verify import verify as work
 
-    result = work(
-        kind, positions, truth=truth, rig=rig, cycle_time_s=cycle_time,
-        limits=options.limits(accuracy_limit, repeatability_limit),
-    )  # fmt: skip
-    inputs = {path.name: sha256(path) for path in (positions, truth, rig) if path is not None}
-    provenance = {"program": f"closerange {__version__}", "inputs": inputs}
+    check_outputs([output, report], [positions, truth, rig])
+    with Progress("comparing"):
+        result = work(
+            kind, positions, truth=truth, rig=rig, cycle_time_s=cycle_time,
+            limits=options.limits(accuracy_limit, repeatability_limit),
+        )  # fmt: skip
+    inputs = input_hashes([path for path in (positions, truth, rig) if path is not None])
+    provenance = {**versions(), "inputs": inputs}
     write_result(result, output, provenance=provenance)
+    keep(output)
     if report is not None:
         write_text(report, report_of_result(read_result(output)))
-    say(result_text(result, output, report), json_output=json_output)
-    if json_output:
-        print_json(result_summary(result, output))
-    return 0
+    return Outcome(result_text(result, output, report), result_summary(result, output))
 
 
-@app.command(epilog="Example: closerange run closerange.toml")
+@app.command(epilog=epilog("run"))
 @verb
 def run(
     project: Annotated[Path, typer.Argument(metavar="PROJECT.toml", help="Project file.")],
@@ -215,60 +234,63 @@ def run(
         Path | None, typer.Option("--output", metavar="DIR", help="Folder of the results.")
     ] = None,
     overwrite: options.Overwrite = False,
-    json_output: options.Json = False,
-) -> int:
+    _json: options.Json = False,
+) -> Outcome:
     """Run a project: detect, calibrate, measure, verify, report."""
-    from closerange.apps.cli.screens import run_summary, run_text
+    from closerange.apps.cli.screens import run_text
     from closerange.workflows.run import run as work
 
     with Progress() as progress:
         result = work(project, output=output, overwrite=overwrite, announce=progress.announce)
-    for note in result.warnings:
-        say(f"warning: {note}", json_output=True)
-    say(run_text(result), json_output=json_output)
-    if json_output:
-        print_json(run_summary(result))
-    return 0
+    return _outcome_of_run(result, run_text(result))
 
 
-@app.command(epilog="Example: closerange demo --output closerange-demo")
+@app.command(epilog=epilog("demo"))
 @verb
 def demo(
     output: Annotated[
         Path, typer.Option("--output", metavar="DIR", help="Folder of the results.")
     ] = Path("closerange-demo"),
     overwrite: options.Overwrite = False,
-    json_output: options.Json = False,
-) -> int:
+    _json: options.Json = False,
+) -> Outcome:
     """Run the whole chain on shipped images; no network, no camera."""
-    from closerange.apps.cli.screens import demo_text, run_summary
+    from closerange.apps.cli.screens import demo_text
     from closerange.workflows.demo import demo as work
 
     with Progress() as progress:
         result = work(output, overwrite=overwrite, announce=progress.announce)
-    for note in result.warnings:
-        say(f"warning: {note}", json_output=True)
-    say(demo_text(result), json_output=json_output)
-    if json_output:
-        print_json(run_summary(result))
-    return 0
+    return _outcome_of_run(result, demo_text(result))
 
 
-@app.command(epilog="Example: closerange report rig.json -o report.html")
+@app.command(epilog=epilog("report"))
 @verb
 def report(
     source: Annotated[
         Path, typer.Argument(metavar="RESULT.json", help="A rig, a result or a run.json.")
     ],
     output: Annotated[Path, options.output("report.html")],
-    json_output: options.Json = False,
-) -> int:
+    _json: options.Json = False,
+) -> Outcome:
     """Render a stored result again, as one HTML file."""
     from closerange.files import write_text
     from closerange.workflows.report import report as work
 
-    write_text(output, work(source))
-    say(f"Report       {output}", json_output=json_output)
-    if json_output:
-        print_json({"report": str(output)})
-    return 0
+    check_outputs([output], [source])
+    with Progress("rendering"):
+        write_text(output, work(source))
+    return Outcome(f"Report       {output}", {"report": str(output)})
+
+
+def _outcome_of_run(result: RunResult, text: str) -> Outcome:
+    from closerange.apps.cli.screens import run_summary
+
+    return Outcome(text, run_summary(result), notes=result.warnings)
+
+
+def _all_flagged(rows: int, output: Path) -> DataError:
+    """Say why the exit code is 1 although a table is written."""
+    return DataError(
+        f"none of the {rows} rows in {output} is free of flags",
+        remedy="the column flags says why; the table is written to be looked at, not relied on",
+    )

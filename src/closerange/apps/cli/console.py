@@ -1,15 +1,18 @@
-"""What every verb does around its work: errors, warnings, progress, JSON."""
+"""What every verb does around its work: errors, warnings, JSON."""
 
 from __future__ import annotations
 
 import functools
 import json
 import math
+import os
 import sys
-import time
+import traceback
 import warnings
 from collections.abc import Callable, Mapping
-from typing import Any, ParamSpec, Self
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, ParamSpec, TextIO
 
 import typer
 
@@ -20,116 +23,193 @@ P = ParamSpec("P")
 INTERRUPTED = 130
 """Exit code after Ctrl-C, as shells expect it."""
 
-QUIET_S = 1.0
-"""Work shorter than this shows no progress."""
+DEFECT = 70
+"""Exit code of a mistake in the program itself (EX_SOFTWARE of sysexits.h): neither the command
+nor the data are to blame."""
 
 _shown: list[str] = []  # warnings of the command that runs, for its JSON summary
+_kept: list[str] = []  # files that it has written, in case it is interrupted
 
 
-def verb(command: Callable[P, int]) -> Callable[P, None]:
-    """Turn a function that returns an exit code into a command.
+@dataclass(frozen=True, slots=True, eq=False)
+class Outcome:
+    """What a verb has to tell.
+
+    Attributes
+    ----------
+    text : str
+        One screen for people.
+    summary : dict
+        The same for machines.
+    notes : tuple of str
+        Warnings that were caught on the way.
+    failure : CloseRangeError or None
+        Why what was written cannot be used; its exit code becomes the command's.
+    """
+
+    text: str
+    summary: Mapping[str, Any]
+    notes: tuple[str, ...] = ()
+    failure: CloseRangeError | None = field(default=None)
+
+
+def verb(command: Callable[P, Outcome]) -> Callable[P, None]:
+    """Turn a function that returns an outcome into a command.
 
     Parameters
     ----------
     command : callable
-        The verb. A keyword argument ``json_output`` says whether JSON was asked for.
+        The verb. Its argument ``_json``, which it needs not look at, asks for JSON.
 
     Returns
     -------
     callable
-        Prints warnings to stderr, and errors as ``error:`` and ``remedy:`` without traceback.
+        Prints the outcome, warnings to stderr, and errors as ``error:`` and ``remedy:``; never a
+        traceback. With JSON, stdout gets exactly one object, whatever happens.
     """
 
     @functools.wraps(command)
     def wrapped(*args: P.args, **kwargs: P.kwargs) -> None:
-        as_json = bool(kwargs.get("json_output"))
+        as_json = bool(kwargs.get("_json"))
         _shown.clear()
+        _kept.clear()
         try:
             with warnings.catch_warnings():
                 warnings.simplefilter("always", CloseRangeWarning)
                 warnings.showwarning = _show_warning
-                code = command(*args, **kwargs)
+                outcome = command(*args, **kwargs)
+            code = _tell(outcome, as_json=as_json)
         except CloseRangeError as error:
-            code = error.exit_code
-            _show_error(error, code, as_json=as_json)
+            code = tell_error(error, as_json=as_json)
         except KeyboardInterrupt:
-            code = INTERRUPTED
-            typer.echo("\ninterrupted: nothing was written", err=True)
+            code = _tell_interruption(as_json=as_json)
+        except MemoryError:
+            error = CloseRangeError(
+                "the memory does not suffice", remedy="use smaller or fewer images at a time"
+            )
+            code = tell_error(error, as_json=as_json)
+        except Exception as defect:  # noqa: BLE001  # whatever it is: words, not a traceback
+            code = _tell_defect(defect, as_json=as_json)
         raise typer.Exit(code)
 
     return wrapped
 
 
-def say(text: str, *, json_output: bool) -> None:
-    """Print a line for people: to stdout, or to stderr where stdout carries JSON."""
-    typer.echo(text, err=json_output)
+def keep(path: Path) -> None:
+    """Note that a file is written, whole, for what is said after Ctrl-C."""
+    _kept.append(str(path))
 
 
-def print_json(summary: Mapping[str, Any]) -> None:
-    """Print a machine-readable summary, with the warnings, on stdout.
+def tell_error(error: CloseRangeError, *, as_json: bool, code: int | None = None) -> int:
+    """Say what is wrong and what to do about it, to people and, if asked for, to machines.
 
-    What is not finite becomes null.
+    Parameters
+    ----------
+    error : CloseRangeError
+        What happened.
+    as_json : bool
+        Also print it as JSON on stdout.
+    code : int, optional
+        Exit code, if not the error's own.
+
+    Returns
+    -------
+    int
+        The exit code.
     """
-    summary = {"warnings": list(dict.fromkeys(_shown)), **summary}
-    typer.echo(json.dumps(_finite(summary), ensure_ascii=False, indent=1))
+    code = error.exit_code if code is None else code
+    _print_error(error)
+    if as_json:
+        _print_json({"error": _described(error, code)})
+    return code
 
 
-class Progress:
-    """A progress bar on stderr that appears only when work takes longer than a second."""
+def _tell(outcome: Outcome, *, as_json: bool) -> int:
+    for note in outcome.notes:
+        echo(f"warning: {note}", to_stderr=True)
+    echo(outcome.text, to_stderr=as_json)
+    failure = outcome.failure
+    if failure is not None:
+        _print_error(failure)
+    if as_json:
+        code = 0 if failure is None else failure.exit_code
+        wrong = {} if failure is None else {"error": _described(failure, code)}
+        _print_json({**outcome.summary, **wrong})
+    return 0 if failure is None else failure.exit_code
 
-    def __init__(self) -> None:
-        self._start = time.monotonic()
-        self._bar: Any = None
-        self._tasks: dict[str, Any] = {}
 
-    def __enter__(self) -> Self:
-        return self
+def _tell_interruption(*, as_json: bool) -> int:
+    what = f"written, whole: {', '.join(_kept)}" if _kept else "nothing was written"
+    echo(f"\ninterrupted: {what}", to_stderr=True)
+    if as_json:
+        error = CloseRangeError(f"interrupted: {what}", remedy="run the command again")
+        _print_json({"error": _described(error, INTERRUPTED, kind="KeyboardInterrupt")})
+    return INTERRUPTED
 
-    def __exit__(self, *_: object) -> None:
-        if self._bar is not None:
-            self._bar.stop()
 
-    def announce(self, what: str, done: int, total: int) -> None:
-        """Show that `done` of `total` steps of something are done."""
-        if self._bar is None:
-            if time.monotonic() - self._start < QUIET_S or not sys.stderr.isatty():
-                return
-            self._open()
-        if what not in self._tasks:
-            self._tasks[what] = self._bar.add_task(what, total=total)
-        self._bar.update(self._tasks[what], completed=done, total=total)
+def _tell_defect(defect: Exception, *, as_json: bool) -> int:
+    """Name the place of a mistake in the program: enough for a report, without a traceback."""
+    frames = traceback.extract_tb(defect.__traceback__)
+    place = f" ({Path(frames[-1].filename).name}, line {frames[-1].lineno})" if frames else ""
+    error = CloseRangeError(
+        f"a defect of closerange, not of your data: {type(defect).__name__}: {defect}{place}",
+        remedy="please report this line with the command and its files",
+    )
+    return tell_error(error, as_json=as_json, code=DEFECT)
 
-    def step(self, what: str) -> Callable[[int, int], None]:
-        """Return a callback (done, total) for one thing that is done."""
-        return functools.partial(self.announce, what)
 
-    def _open(self) -> None:
-        from rich.console import Console
-        from rich.progress import BarColumn, MofNCompleteColumn, TextColumn
-        from rich.progress import Progress as Bars
+def _described(error: CloseRangeError, code: int, *, kind: str = "") -> dict[str, Any]:
+    return {
+        "message": error.message,
+        "remedy": error.remedy,
+        "exit_code": code,
+        "kind": kind or type(error).__name__,
+    }
 
-        self._bar = Bars(
-            TextColumn("{task.description}"),
-            BarColumn(),
-            MofNCompleteColumn(),
-            console=Console(stderr=True),
-            transient=True,
-        )
-        self._bar.start()
+
+def _print_error(error: CloseRangeError) -> None:
+    for label, text in (("error: ", error.message), ("remedy: ", error.remedy)):
+        if text:
+            echo(label + text.replace("\n", "\n" + " " * len(label)), to_stderr=True)
+
+
+def _print_json(summary: Mapping[str, Any]) -> None:
+    """Print one object with the warnings; what is not finite becomes null."""
+    whole = {"warnings": list(dict.fromkeys(_shown)), **summary}
+    echo(json.dumps(_finite(whole), ensure_ascii=False, indent=1), to_stderr=False)
+
+
+def echo(text: str, *, to_stderr: bool) -> None:
+    """Print a text; a reader that went away, as ``head`` does, is no reason to fail.
+
+    Parameters
+    ----------
+    text : str
+        What to print.
+    to_stderr : bool
+        Where to.
+    """
+    stream = sys.stderr if to_stderr else sys.stdout
+    try:
+        _write(stream, text + "\n")
+    except BrokenPipeError:
+        # the interpreter flushes once more when it ends: let that go nowhere
+        os.dup2(os.open(os.devnull, os.O_WRONLY), stream.fileno())
+
+
+def _write(stream: TextIO, text: str) -> None:
+    """Write; a character that the terminal lacks, as in a file's name, is written as a number."""
+    try:
+        stream.write(text)
+    except UnicodeEncodeError:
+        encoding = stream.encoding or "ascii"
+        stream.write(text.encode(encoding, "backslashreplace").decode(encoding))
+    stream.flush()
 
 
 def _show_warning(message: Warning | str, *_: Any, **__: Any) -> None:
     _shown.append(str(message))
-    typer.echo(f"warning: {message}", err=True)
-
-
-def _show_error(error: CloseRangeError, code: int, *, as_json: bool) -> None:
-    first, *rest = error.message.splitlines() or [""]
-    typer.echo("\n".join([f"error: {first}", *(f"       {line}" for line in rest)]), err=True)
-    if error.remedy:
-        typer.echo(f"remedy: {error.remedy}", err=True)
-    if as_json:
-        print_json({"error": error.message, "remedy": error.remedy, "exit_code": code})
+    echo(f"warning: {message}", to_stderr=True)
 
 
 def _finite(value: Any) -> Any:

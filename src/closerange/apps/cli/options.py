@@ -18,6 +18,19 @@ Json = Annotated[bool, typer.Option("--json", help="Print a machine-readable sum
 Report = Annotated[
     Path | None, typer.Option("--report", metavar="report.html", help="Also write a report.")
 ]
+Times = Annotated[
+    Path | None,
+    typer.Option(
+        metavar="TIMES.csv",
+        help="When the images were taken (camera, placement, time_s); needs --time-tolerance.",
+    ),
+]
+TimeTolerance = Annotated[
+    float | None,
+    typer.Option(
+        metavar="SECONDS", help="Largest time between the cameras' images of one placement."
+    ),
+]
 Overwrite = Annotated[
     bool, typer.Option("--overwrite", help="Replace an existing folder of results.")
 ]
@@ -75,3 +88,33 @@ def limits(
     from closerange.verification.acceptance import Limits
 
     return Limits.of(accuracy_mm=accuracy_mm, repeatability_mm=repeatability_mm)
+
+
+def check_times(points: Sequence[Path], times: Path | None, tolerance_s: float | None) -> None:
+    """Refuse points of images that were not taken together, if it is told when they were.
+
+    Parameters
+    ----------
+    points : sequence of Path
+        Points tables.
+    times : Path or None
+        Table of exposure times.
+    tolerance_s : float or None
+        Largest time between the cameras of one placement, in seconds.
+
+    Raises
+    ------
+    InputError
+        If one option is given without the other, or images were taken further apart.
+    """
+    if times is None and tolerance_s is None:
+        return
+    if times is None or tolerance_s is None:
+        raise InputError(
+            f"{'--time-tolerance' if times is None else '--times'} was given alone",
+            remedy="give --times TIMES.csv and --time-tolerance SECONDS together; at v mm/s an "
+            "object moves v x SECONDS mm meanwhile",
+        )
+    from closerange.workflows.times import require_simultaneous
+
+    require_simultaneous(points, times=times, tolerance_s=tolerance_s)

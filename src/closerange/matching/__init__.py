@@ -1,0 +1,1 @@
+"""The same feature in other views: search geometry, matches and their table."""

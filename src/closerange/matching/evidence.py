@@ -1,0 +1,158 @@
+"""What the images say for and against each candidate: a cost in pixels of misfit."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from closerange.features.edge_chains import chain_window
+from closerange.features.edges import EdgePoints
+from closerange.geometry.arrays import BoolArray, FloatArray
+from closerange.geometry.interpolation import bilinear
+from closerange.matching.candidates import Candidates
+from closerange.matching.depth_table import MISFIT_LIMIT_PX, DepthTable
+
+WINDOW_SHARES = (0.022, 0.045)
+"""Half-widths of the two square structuring elements per image width. Small parts of a picture
+that shows whole parts are a fiftieth of it wide; the larger element tells repeated small ones
+apart. Two sizes with equal weight beat each alone on three quite different scenes
+(correspondence report, 'averaged')."""
+
+TURN_RAD = 0.4
+"""Angle between expected and found direction that counts as much as one pixel of misfit: an edge
+that is turned so much has left its place by one pixel within three."""
+
+TURN_WEIGHT = 0.3
+"""Share of the turn of the candidate itself: its neighbours' turns are already in their misfit."""
+
+UPRIGHT_RAD = 0.15
+"""An edge so near to the image of the sweep axis, in both views, may run along it."""
+
+UPRIGHT_PRICE = 0.2
+"""Cost in px of the less usual hypothesis that an edge runs along the sweep axis."""
+
+UPRIGHT_REACH = 10
+"""Points of the chain on each side that must agree with that hypothesis."""
+
+SIDE_TOLERANCE = 0.3
+"""Difference of the grey values beside an edge, per its contrast, that counts as one misfit unit:
+a matt surface changes its brightness by less between views 30 degrees apart."""
+
+SIDE_LIMIT = 2.0
+"""More than so many units say no more: a highlight differs without limit."""
+
+SIDE_STEP_PX = 2.5
+"""Distance from the edge, beyond its blur, at which the grey beside it is read."""
+
+LEAST_CONTRAST = 15.0 / 255.0
+"""Differences of grey below this share of the range are never held against a candidate."""
+
+
+def turn(first: EdgePoints, candidates: Candidates) -> FloatArray:
+    """Return the angle between the found direction and that of a level edge, rad, shape (M,)."""
+    expected = np.einsum("nij,nj->ni", candidates.level, first.tangent[candidates.point])
+    cosine = _cosine(expected, candidates.tangent)
+    return np.asarray(np.arccos(np.clip(np.nan_to_num(cosine, nan=-1.0), -1.0, 1.0)))
+
+
+def unary_cost(
+    first: EdgePoints,
+    candidates: Candidates,
+    greys: tuple[NDArray[Any], NDArray[Any]],
+    axis: int,
+) -> FloatArray:
+    """Return the cost of each candidate, in pixels of misfit, shape (M,).
+
+    Three terms: how well the edges within two structuring elements around the point fit at the
+    candidate's height (or, for an edge that may run along the sweep axis, how well its chain fits
+    there); how far the edge is turned; how much the grey of the more similar side differs. The
+    nearer surface is on one side only, hence the better side is what counts.
+
+    Parameters
+    ----------
+    first : EdgePoints
+        Edges of the first view.
+    candidates : Candidates
+        Their crossings in the second view.
+    greys : tuple of two ndarrays, shape (H, W)
+        Grey values of both images on a common scale of 0 to 1, equal for equal brightness.
+    axis : int
+        The sweep axis.
+
+    Returns
+    -------
+    ndarray, shape (M,)
+        Small is good.
+    """
+    if not len(candidates):
+        return np.zeros(0)
+    turned = np.clip(turn(first, candidates) / TURN_RAD, 0.0, MISFIT_LIMIT_PX)
+    table = DepthTable.of(len(first), candidates, turned, axis)
+    width = first.size_px[0]
+    support = np.mean(
+        [table.support(first.xy_px, candidates, share * width) for share in WINDOW_SHARES], axis=0
+    )
+    cost = support + TURN_WEIGHT * turned
+    upright, slope = _upright(first, candidates)
+    if upright.any():
+        rows = candidates.select(upright)
+        chain = _chain_misfit(first, rows, slope[upright], axis)
+        cost[upright] = np.minimum(cost[upright], chain + UPRIGHT_PRICE)
+    return np.asarray(cost + side_cost(first, candidates, greys))
+
+
+def side_cost(
+    first: EdgePoints, candidates: Candidates, greys: tuple[NDArray[Any], NDArray[Any]]
+) -> FloatArray:
+    """Return how much the grey of the more similar side differs, in misfit units, shape (M,)."""
+    beside_1 = _sides(greys[0], first.xy_px, first.normal)[candidates.point]
+    # across the crossed chain, towards its brighter side
+    normal = np.column_stack([candidates.tangent[:, 1], -candidates.tangent[:, 0]])
+    beside_2 = _sides(greys[1], candidates.xy_px, normal)
+    contrast = np.maximum(np.abs(beside_1[:, 1] - beside_1[:, 0]), LEAST_CONTRAST)
+    difference = np.abs(beside_1 - beside_2).min(axis=1) / contrast
+    return np.asarray(np.minimum(difference / SIDE_TOLERANCE, SIDE_LIMIT))
+
+
+def _sides(grey: NDArray[Any], xy_px: FloatArray, normal: FloatArray) -> FloatArray:
+    """Read the grey on the dark and on the bright side, shape (N, 2)."""
+    smooth = cv2.GaussianBlur(grey, (0, 0), 0.7)
+    return np.column_stack(
+        [bilinear(smooth, xy_px + sign * SIDE_STEP_PX * normal) for sign in (-1, 1)]
+    )
+
+
+def _upright(first: EdgePoints, candidates: Candidates) -> tuple[BoolArray, FloatArray]:
+    """Mark edges that may run along the sweep axis; return their mm of it per px of chain."""
+    along_1 = _cosine(candidates.upright_first, first.tangent[candidates.point])
+    along_2 = _cosine(candidates.upright_second, candidates.tangent)
+    least = np.cos(UPRIGHT_RAD)
+    upright = (np.abs(along_1) > least) & (np.abs(along_2) > least) & (along_1 * along_2 > 0)
+    length = np.linalg.norm(candidates.upright_first, axis=1)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        return upright, 1.0 / (length * along_1)
+
+
+def _chain_misfit(
+    first: EdgePoints, upright: Candidates, slope: FloatArray, axis: int
+) -> FloatArray:
+    """Return the mean misfit of a chain that climbs along the sweep axis, shape (M,)."""
+    table = DepthTable.of(len(first), upright, np.zeros(len(upright)), axis)
+    window = chain_window(first.after, first.before, UPRIGHT_REACH)[upright.point]
+    there = window >= 0
+    step = first.xy_px[window] - first.xy_px[upright.point][:, None]
+    way = np.einsum("nki,ni->nk", step, first.tangent[upright.point])
+    height = upright.xyz_mm[:, axis, None] + slope[:, None] * way
+    misfit = np.where(there, table.at(window, height), 0.0)
+    return np.asarray(misfit.sum(axis=1) / there.sum(axis=1))
+
+
+def _cosine(a: FloatArray, b: FloatArray) -> FloatArray:
+    length = np.linalg.norm(a, axis=1) * np.linalg.norm(b, axis=1)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        return np.asarray(np.einsum("ni,ni->n", a, b) / length)
+
+
