@@ -37,6 +37,7 @@ class Flag(IntFlag):
     outside_image = 1 << 18  # it, or all of its epipolar segment, lies outside of the image
     no_edge = 1 << 19  # no edge where one was needed
     inconsistent = 1 << 20  # the match, matched back, does not return to it
+    beyond_lens = 1 << 21  # a view lies where the lens model has no answer; it was left out
 
 
 def format_flags(flag: Flag | int) -> str:

@@ -207,10 +207,6 @@ def test_item_35_lost_minus_is_an_outlier_with_a_hint(tables, run, tmp_path, axi
     assert rig["noise_px"] == pytest.approx(0.05, rel=0.2)
 
 
-@pytest.mark.xfail(
-    strict=True,
-    reason="one far control row can still spoil the fit of a camera with a narrow view: refused",
-)
 def test_item_35_lost_decimal_point_is_an_outlier_too(tables, run, tmp_path):
     def lose(row):
         if (row["placement"], row["point"]) == ("z4", "r1c2"):
@@ -221,6 +217,12 @@ def test_item_35_lost_decimal_point_is_an_outlier_too(tables, run, tmp_path):
     outcome = run(*tables.calibrate, "--model", "brown", "-o", tmp_path / "rig.json")
     assert outcome.code == 0
     assert "z4/r1c2" in outcome.stderr
+    rig = json.loads((tmp_path / "rig.json").read_text(encoding="utf-8"))
+    assert rig["trust"]["verdict"] == "good"
+    column = rig["residuals"]["columns"].index("flags")
+    flags = [row[column] for row in rig["residuals"]["rows"]]
+    assert flags.count("outlier") == 2  # one row, both cameras
+    assert len(flags) == 126  # kept in the table
 
 
 @pytest.mark.parametrize(

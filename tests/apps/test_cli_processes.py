@@ -52,11 +52,15 @@ def shown(tmp_path_factory):
         ("verify", ["result.json", "report.html"]),
         ("run", ["closerange-demo/inputs/results/report.html"]),
         ("report", ["report.html"]),
+        ("shapes teach", ["shapes.json"]),
+        ("shapes find", ["shape-points.csv"]),
     ],
 )
 def test_examples_of_the_helps_work_when_pasted_after_the_demo(shown, verb, written):
     text = shell(f"closerange {verb} --help", shown).stdout
     example = text.partition("Example (after closerange demo):")[2]
+    if verb == "shapes find":
+        shell(line("shapes teach"), shown)
     for name in written:
         (shown / name).unlink(missing_ok=True)
     done = shell(example, shown)

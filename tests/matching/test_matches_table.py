@@ -106,6 +106,7 @@ def test_it_is_a_points_table_which_measure_reads_without_warning(tmp_path):
     positions = measure(rig, tmp_path / "m.csv")  # a warning would be an error here
     assert np.abs(positions.xyz_mm - xyz).max() < 1e-8
     assert not positions.flags.any()
+    assert np.array_equal(measure(rig, matches).xyz_mm, positions.xyz_mm)
 
 
 def test_a_points_table_without_mismatch_is_a_matches_table(tmp_path):

@@ -8,15 +8,30 @@ import numpy as np
 import pytest
 from scipy.stats import f as f_distribution
 
-from closerange.errors import CloseRangeWarning
+from closerange.errors import CloseRangeWarning, GeometryError
 from closerange.position.triangulate import triangulate_linear
 from closerange.rig.calibrate import calibrate_rig
 from closerange.rig.camera_fit import fit_camera
 from closerange.rig.models import FREE
-from closerange.rig.outliers import FALSE_ALARM, fit_without_blunders, limit, predicted, snoop
+from closerange.rig.outliers import (
+    FALSE_ALARM,
+    consensus,
+    fit_without_blunders,
+    limit,
+    predicted,
+    snoop,
+)
 from closerange.rig.view import View
 from closerange.verification.bound import position_bound, rms_3d_mm
-from closerange.verification.scenes import control_grid, observe, random_positions, rig_a, rig_b
+from closerange.verification.scenes import (
+    control_grid,
+    looking_at_origin,
+    observe,
+    random_positions,
+    rig_a,
+    rig_b,
+)
+from closerange.verification.trust import judge_rig
 
 BROWN = FREE["brown"]
 NOISE_PX = 0.05
@@ -145,6 +160,86 @@ def test_a_wrong_control_row_is_measured():
         rig = calibrate_rig(points, replace(control, xyz_mm=xyz), sizes(scene), model="brown")
     assert {entry["point"] for entry in rig.report["outliers"]} == {control.point[row]}
     assert (~rig.residuals.fitted).sum() == 2
+
+
+def three_cameras():
+    """Rig A with a third camera that looks along Z: errors of Z are hidden from it."""
+    pair = rig_a()
+    middle = looking_at_origin("middle", angle_rad=0.0, distance_mm=1500.0, focal_px=4800.0)
+    return replace(pair, cameras=(*pair.cameras, middle))
+
+
+@pytest.mark.parametrize("scene", [rig_a, rig_b, three_cameras])
+@pytest.mark.parametrize("points", [27, 63])
+def test_one_wrong_control_row_of_any_size(scene, points):
+    """From 0.5 mm to 3 m in any direction: that row is left out by all cameras, and no other.
+
+    Behind a camera that sees it, it is refused by name.
+    """
+    rig, control = scene(), control_grid(points)
+    for number, size_mm in enumerate(0.5 * 6000 ** np.linspace(0, 1, 6)):
+        rng = np.random.default_rng([points, number])
+        seen = observe(rig.cameras, control, noise_px=NOISE_PX, rng=rng)
+        row, axis = rng.integers(points), rng.integers(3)
+        xyz = control.xyz_mm.copy()
+        xyz[row, axis] += size_mm * rng.choice([-1, 1])
+        wrong = replace(control, xyz_mm=xyz)
+        if any(camera.depth_mm(xyz[row]).item() <= 0 for camera in rig.cameras):
+            with pytest.raises(GeometryError, match=f"{control.point[row]}.* behind camera"):
+                calibrate_rig(seen, wrong, sizes(rig), model="brown")
+            continue
+        with pytest.warns(CloseRangeWarning, match="outliers are left out"):
+            result = calibrate_rig(seen, wrong, sizes(rig), model="brown")
+        out = np.flatnonzero(~result.residuals.fitted)
+        assert [result.residuals.point[i] for i in out] == [control.point[row]] * len(rig.cameras)
+        assert result.noise_px == pytest.approx(NOISE_PX, rel=0.35)  # 23 to 209 dof
+        assert judge_rig(result).verdict == "good"
+
+
+def test_a_far_row_does_not_stretch_the_volume():
+    scene, control = rig_b(), control_grid(27)
+    seen = observe(scene.cameras, control, noise_px=NOISE_PX, rng=np.random.default_rng(16))
+    xyz = control.xyz_mm.copy()
+    xyz[5, 0] *= 10  # a lost decimal point
+    with pytest.warns(CloseRangeWarning, match="2 outliers"):
+        rig = calibrate_rig(seen, replace(control, xyz_mm=xyz), sizes(scene), model="brown")
+    np.testing.assert_array_equal(rig.volume_mm, scene.volume_mm)
+
+
+@pytest.mark.parametrize("scene", [rig_a, rig_b])
+def test_one_wrong_image_point_of_any_size(scene):
+    """From 0.5 to 300 px: that point is left out, and its row stays in the other camera."""
+    for number, size_px in enumerate(0.5 * 600 ** np.linspace(0, 1, 5)):
+        rng = np.random.default_rng(number)
+        rig, control = scene(), control_grid(27)
+        seen = observe(rig.cameras, control, noise_px=NOISE_PX, rng=rng)
+        row = int(rng.integers(len(seen)))
+        xy = seen.xy_px.copy()
+        towards_middle = np.array([640.0, 512.0]) - xy[row]  # so that it stays in the image
+        xy[row] += size_px * towards_middle / np.linalg.norm(towards_middle)
+        with pytest.warns(CloseRangeWarning, match="1 outliers"):
+            result = calibrate_rig(replace(seen, xy_px=xy), control, sizes(rig), model="brown")
+        assert np.flatnonzero(~result.residuals.fitted).tolist() == [row]
+
+
+def test_consensus_has_no_part_for_far_points():
+    """A third of the points are anywhere, some behind the camera."""
+    rng = np.random.default_rng(18)
+    view = noisy_view(rng, 63)
+    rows = rng.choice(63, 21, replace=False)
+    xyz = view.xyz_mm.copy()
+    xyz[rows] = rng.normal(0, 1000, (21, 3))
+    agreeing = consensus(replace(view, xyz_mm=xyz))
+    assert not agreeing[rows].any()
+    assert np.count_nonzero(agreeing) > 0.8 * 42
+
+
+@pytest.mark.parametrize("scene", [rig_a, rig_b])
+@pytest.mark.parametrize("points", [27, 63])
+def test_a_mirrored_world_is_not_sorted_into_a_camera(scene, points):
+    view = noisy_view(np.random.default_rng(20), points, scene)
+    with pytest.raises(GeometryError, match="mirrored camera"):
+        clean(replace(view, xyz_mm=view.xyz_mm * [1, 1, -1]))
 
 
 def test_exchanged_labels_are_recognised():

@@ -27,6 +27,7 @@ from closerange.delivery.wording import fixed, short_length
 from closerange.geometry.arrays import BoolArray, FloatArray
 from closerange.matching.common_view import (
     CommonView,
+    common_view,
     mean_direction,
     parallel_axes,
     shared_field,
@@ -181,8 +182,7 @@ def _section(
         air=0.0,
     )
     middle = volume.mean(axis=0)
-    names = "XYZ"
-    cut = 3 - axis - view.depth_axis
+    names, cut = "XYZ", 3 - axis - view.depth_axis
     size = f"{_short(volume[1, axis] - volume[0, axis])} mm in {names[axis]}"
     depth = f"{_short(volume[1, view.depth_axis] - volume[0, view.depth_axis])} mm"
     _frame(
@@ -193,13 +193,21 @@ def _section(
     )
     _common(drawing, window, field, middle)
     _box(drawing, window, volume)
-    known = np.isfinite(view.depth_std_mm)
-    for level in (volume[0], middle, volume[1]):
-        at = float(level[view.depth_axis])
-        std = float(np.interp(at, view.depths_mm[known], view.depth_std_mm[known]))
-        x, y = window.at(float(volume[1, axis]), at)
+    beside = window.of(volume[1])[0] + 6
+    for level, std in _depth_errors(field, view, volume):
+        _, y = window.at(float(middle[axis]), level)
         text = f"{names[view.depth_axis]} ± {short_length(std)}"
-        drawing.text((x + 6, y + 4), text, fill=PURPLE)
+        drawing.text((beside, y + 4), text, fill=PURPLE)
+
+
+def _depth_errors(field: _Field, view: CommonView, volume: FloatArray) -> list[tuple[float, float]]:
+    """Return the typical depth error at the ends and in the middle of the volume."""
+    cell = (volume[1] - volume[0]) / 2
+    around = np.stack([volume[0] - cell / 2, volume[1] + cell / 2])  # nodes on the walls
+    close = common_view(
+        field.cameras, least=view.least, noise_px=view.noise_px, nodes=3, within_mm=around
+    )
+    return list(zip(close.depths_mm.tolist(), close.depth_std_mm.tolist(), strict=True))
 
 
 def _far(cameras: Sequence[Camera], volume: FloatArray) -> float:
@@ -318,18 +326,11 @@ def _pieces(seen: BoolArray) -> list[list[tuple[int, int, int]]]:
 
 def _box(drawing: Drawing, window: _Window, volume: FloatArray) -> None:
     """Draw the outline of the volume."""
-    corners = [window.of(np.where(pick, volume[1], volume[0])) for pick in _picks(window.axes)]
-    drawing.path(corners, closed=True, stroke=PURPLE, stroke_width=1.3)
-
-
-def _picks(axes: tuple[int, int]) -> list[BoolArray]:
-    """Choose lower or upper limits for the four corners, going round."""
-    rounds = []
-    for across, deep in ((0, 0), (1, 0), (1, 1), (0, 1)):
-        pick = np.zeros(3, np.bool_)
-        pick[axes[0]], pick[axes[1]] = bool(across), bool(deep)
-        rounds.append(pick)
-    return rounds
+    (left, front), (right, back) = volume[:, window.axes].tolist()
+    corners = ((left, front), (right, front), (right, back), (left, back))
+    drawing.path(
+        [window.at(*corner) for corner in corners], closed=True, stroke=PURPLE, stroke_width=1.3
+    )
 
 
 def _frame(drawing: Drawing, window: _Window, title: str, detail: str) -> None:
@@ -380,7 +381,7 @@ def _key(drawing: Drawing, view: CommonView) -> None:
     entries = (
         ("camera and its field", BLUE),
         (f"seen by {view.least} cameras", GREEN),
-        ("volume; ± is one standard deviation for " + f"{fixed(view.noise_px, 3)} px", PURPLE),
+        (f"volume; ± is one standard deviation for {fixed(view.noise_px, 3)} px", PURPLE),
     )
     for label, colour in entries:
         drawing.dot((x, y), 3.5, colour)

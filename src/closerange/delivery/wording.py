@@ -36,6 +36,7 @@ FLAG_WORDS: dict[Flag, str] = {
     Flag.outside_image: "it, or all of its epipolar segment, lies outside of the image",
     Flag.no_edge: "no edge where one was needed",
     Flag.inconsistent: "the match, matched back, does not return to it",
+    Flag.beyond_lens: "a view lies where the lens model has no answer; it was left out",
 }
 
 _MICROMETRES = re.compile(r"(?<=\d )um\b")

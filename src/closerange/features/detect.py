@@ -63,28 +63,10 @@ def detect_target(
         If points are blurred, cut by the border, or more than 1 % of the target's pixels are
         saturated (then all rows carry the flag).
     """
-    pattern = target.pattern
-    if pattern is None:
-        raise DetectionError(
-            'a target of kind "points" has no pattern that could be found in an image',
-            remedy="write its image points into a points table and calibrate with that",
-        )
     where = frame.source or f"image of camera {frame.camera!r}"
-    try:
-        if isinstance(pattern, DiscGrid):
-            points = _discs(frame, target, pattern, estimator)
-        else:
-            points = _corners(frame, target, pattern)
-    except DetectionError as error:
-        message = error.message if where in error.message else f"{where}: {error.message}"
-        raise DetectionError(message, remedy=error.remedy) from error
+    points = _find(frame, target, estimator, where)
     flags = _with_saturation(frame, points, where)
-    _warn_of(flags, Flag.blurred, f"{where}: {{}} of {{}} points are blurred; focus the lens")
-    _warn_of(
-        flags,
-        Flag.at_border,
-        f"{where}: {{}} of {{}} points are cut by the image border; move the target inwards",
-    )
+    _warn_of_defects(flags, where)
     return ImagePoints.of(
         camera=frame.camera,
         placement=placement,
@@ -98,6 +80,23 @@ def detect_target(
         size_px={frame.camera: frame.size_px},
         noise_cov_px2=points.noise_cov_px2,
     )
+
+
+def _find(frame: Frame, target: Target, estimator: str, where: str) -> ImagePoints:
+    """Find the target's points by its kind; errors name the image."""
+    pattern = target.pattern
+    if pattern is None:
+        raise DetectionError(
+            'a target of kind "points" has no pattern that could be found in an image',
+            remedy="write its image points into a points table and calibrate with that",
+        )
+    try:
+        if isinstance(pattern, DiscGrid):
+            return _discs(frame, target, pattern, estimator)
+        return _corners(frame, target, pattern)
+    except DetectionError as error:
+        message = error.message if where in error.message else f"{where}: {error.message}"
+        raise DetectionError(message, remedy=error.remedy) from error
 
 
 def _corners(frame: Frame, target: Target, pattern: Chessboard | Charuco) -> ImagePoints:
@@ -188,8 +187,13 @@ def _saturated_share(frame: Frame, points: ImagePoints) -> float:
     return float((inside >= saturation_level(frame)).mean()) if inside.size else 0.0
 
 
-def _warn_of(flags: IntArray, flag: Flag, text: str) -> None:
-    """Warn once if any row carries a flag; the text's braces take how many of how many."""
-    count = int(np.count_nonzero(flags & flag))
-    if count:
-        warnings.warn(text.format(count, len(flags)), CloseRangeWarning, stacklevel=3)
+def _warn_of_defects(flags: IntArray, where: str) -> None:
+    """Warn once of each defect that the user could mend by taking the image again."""
+    for flag, what in (
+        (Flag.blurred, "are blurred; focus the lens"),
+        (Flag.at_border, "are cut by the image border; move the target inwards"),
+    ):
+        count = int(np.count_nonzero(flags & flag))
+        if count:
+            text = f"{where}: {count} of {len(flags)} points {what}"
+            warnings.warn(text, CloseRangeWarning, stacklevel=3)

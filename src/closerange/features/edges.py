@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import cv2
@@ -11,6 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from closerange.errors import InputError
 from closerange.features.edge_chains import chain_numbers, link_edges
+from closerange.features.edge_uncertainty import WIDE, model_std
 from closerange.features.grey_noise import WINDOW_PX, noise_curve
 from closerange.geometry.arrays import BoolArray, FloatArray, IntArray, frozen_array, frozen_ints
 from closerange.geometry.interpolation import bicubic, bilinear
@@ -45,8 +46,11 @@ class EdgePoints:
     width_px2 : ndarray, shape (N,)
         Second moment of the gradient's profile: blur of the image and of the operator, and more
         where two edges are so near to each other that they look like one.
-    std_px : ndarray, shape (N,)
+    noise_px : ndarray, shape (N,)
         Standard deviation along the normal that the noise of the pixels causes.
+    model_px : ndarray, shape (N,)
+        Standard deviation along the normal of what the edge is not: an ideal step. Neighbours
+        share it; see `closerange.features.edge_uncertainty`.
     after, before : ndarray of int, shape (N,)
         The next and the previous point of the chain, with the brighter side on the left of an
         observer who walks along it with y down; -1 at an end.
@@ -58,7 +62,8 @@ class EdgePoints:
     normal: FloatArray
     strength: FloatArray
     width_px2: FloatArray
-    std_px: FloatArray
+    noise_px: FloatArray
+    model_px: FloatArray
     after: IntArray
     before: IntArray
     size_px: tuple[int, int]
@@ -67,7 +72,7 @@ class EdgePoints:
         count = len(self.strength)
         for name in ("xy_px", "normal"):
             object.__setattr__(self, name, frozen_array(getattr(self, name), (count, 2), name))
-        for name in ("strength", "width_px2", "std_px"):
+        for name in ("strength", "width_px2", "noise_px", "model_px"):
             object.__setattr__(self, name, frozen_array(getattr(self, name), (count,), name))
         for name in ("after", "before"):
             object.__setattr__(self, name, frozen_ints(getattr(self, name), (count,), name))
@@ -89,7 +94,8 @@ class EdgePoints:
             self.normal[kept],
             self.strength[kept],
             self.width_px2[kept],
-            self.std_px[kept],
+            self.noise_px[kept],
+            self.model_px[kept],
             after,
             before,
             self.size_px,
@@ -151,11 +157,15 @@ def find_edges(
     normal /= np.linalg.norm(normal, axis=1, keepdims=True)
     xy_px, strength, width = _peak(magnitude, np.column_stack([column, row]), normal)
     # the peak moves by the noise of the second derivative over the curvature of the peak
-    std_px = second * noise * width / strength
+    noise_px = second * noise * width / strength
     size_px = (grey.shape[1], grey.shape[0])
-    after, before = link_edges(xy_px, normal, size_px)
-    found = EdgePoints(xy_px, normal, strength, width, std_px, after, before, size_px)
-    return found.select(_long(found, shortest))
+    chains = link_edges(xy_px, normal, size_px)
+    long = _long(chains[0], shortest)
+    found = EdgePoints(
+        xy_px, normal, strength, width, noise_px, np.zeros(len(row)), *chains, size_px
+    ).select(long)
+    drift = _drift(grey, found, WIDE * scale_px)
+    return replace(found, model_px=model_std(found.strength, found.width_px2, drift, found.after))
 
 
 def _gradient(grey: NDArray[np.float32], scale_px: float) -> tuple[NDArray[np.float32], ...]:
@@ -215,7 +225,14 @@ def _vertex(below: FloatArray, here: FloatArray, above: FloatArray) -> tuple[Flo
     return 0.5 * (above - below) / curvature, curvature
 
 
-def _long(edges: EdgePoints, shortest: int) -> BoolArray:
+def _drift(grey: NDArray[np.float32], edges: EdgePoints, scale_px: float) -> FloatArray:
+    """Return how far each edge moves along its normal when it is looked at more coarsely, px."""
+    magnitude = cv2.magnitude(*_gradient(grey, scale_px))
+    samples = (bicubic(magnitude, edges.xy_px + step * edges.normal) for step in (-1, 0, 1))
+    return np.clip(_vertex(*samples)[0], -1.0, 1.0)
+
+
+def _long(after: IntArray, shortest: int) -> BoolArray:
     """Mark the points of chains of at least so many points."""
-    chain = chain_numbers(edges.after)
+    chain = chain_numbers(after)
     return np.asarray(np.bincount(chain, minlength=1)[chain] >= shortest)

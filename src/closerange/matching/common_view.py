@@ -12,6 +12,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import ArrayLike
 
+from closerange.errors import GeometryError
 from closerange.geometry.arrays import BoolArray, FloatArray, IntArray, frozen_array, frozen_ints
 from closerange.geometry.transform import RigidTransform, rotation_from_vector
 from closerange.matching.search import plane_mapping
@@ -20,6 +21,7 @@ from closerange.matching.view_grid import (
     MIN_ANGLE_RAD,
     checked_cameras,
     field_grid,
+    lay_grid,
     pixel_grid,
 )
 from closerange.matching.volume_proposal import check_in_view, propose_volume
@@ -143,6 +145,7 @@ def common_view(
     noise_px: float | None = None,
     margin_px: float = 0.0,
     nodes: int = NODES,
+    within_mm: ArrayLike | None = None,
 ) -> CommonView:
     """Find the region that the cameras of a rig see in common.
 
@@ -159,6 +162,8 @@ def common_view(
         element.
     nodes : int, optional
         Nodes along each side of the grid.
+    within_mm : array_like, shape (2, 3), optional
+        Lay the grid into this box, to look closer at a part of the region.
 
     Returns
     -------
@@ -171,11 +176,19 @@ def common_view(
         If `least` is not between 2 and the number of cameras, or an image has nothing left
         within the margin.
     GeometryError
-        If there is no such place.
+        If there is no such place, or none within the box.
     """
     cameras, count = checked_cameras(rig, least, margin_px)
     noise = noise_px if noise_px is not None else rig.noise_px if isinstance(rig, Rig) else 1.0
-    grid = field_grid(cameras, nodes=nodes, least=count, margin_px=margin_px)
+    if within_mm is None:
+        grid = field_grid(cameras, nodes=nodes, least=count, margin_px=margin_px)
+    else:
+        box = np.asarray(within_mm, np.float64)
+        grid = lay_grid(cameras, box, nodes=nodes, least=count, margin_px=margin_px)
+    if not grid.inside.any():
+        raise GeometryError(
+            "no place in the box is seen by enough cameras", remedy="choose a box that they see"
+        )
     return CommonView(
         cameras=tuple(camera.name for camera in cameras),
         least=count,

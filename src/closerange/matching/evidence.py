@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial import cKDTree
 
 from closerange.features.edge_chains import chain_window
 from closerange.features.edges import EdgePoints
@@ -14,6 +16,7 @@ from closerange.geometry.arrays import BoolArray, FloatArray
 from closerange.geometry.interpolation import bilinear
 from closerange.matching.candidates import Candidates
 from closerange.matching.depth_table import MISFIT_LIMIT_PX, DepthTable
+from closerange.rig.camera import Camera
 
 WINDOW_SHARES = (0.022, 0.045)
 """Half-widths of the two square structuring elements per image width. Small parts of a picture
@@ -41,14 +44,30 @@ SIDE_TOLERANCE = 0.3
 """Difference of the grey values beside an edge, per its contrast, that counts as one misfit unit:
 a matt surface changes its brightness by less between views 30 degrees apart."""
 
+FAR_WEIGHT = 0.25
+"""Weight of the less similar side: behind an edge the views see different things, but not always."""
+
 SIDE_LIMIT = 2.0
 """More than so many units say no more: a highlight differs without limit."""
 
 SIDE_STEP_PX = 2.5
 """Distance from the edge, beyond its blur, at which the grey beside it is read."""
 
-LEAST_CONTRAST = 15.0 / 255.0
-"""Differences of grey below this share of the range are never held against a candidate."""
+LEAST_CONTRAST = 0.06
+"""Differences of grey below this share of the image's range are not held against a candidate much:
+shading makes as much on one surface."""
+
+OTHER_WEIGHT = 0.5
+"""Weight of a further view against the two that are matched."""
+
+HIDDEN_PX = 2.0
+"""Misfit in a further view where nothing is near."""
+
+GOOD_PX = 1.0
+"""Cost of candidates from which the brightness of the two views is compared: misfit of a pixel."""
+
+LEAST_PAIRS = 40
+"""Pairs of grey values without which both cameras are taken to see the same brightness."""
 
 
 def turn(first: EdgePoints, candidates: Candidates) -> FloatArray:
@@ -63,6 +82,7 @@ def unary_cost(
     candidates: Candidates,
     greys: tuple[NDArray[Any], NDArray[Any]],
     axis: int,
+    others: Sequence[tuple[Camera, EdgePoints]] = (),
 ) -> FloatArray:
     """Return the cost of each candidate, in pixels of misfit, shape (M,).
 
@@ -78,9 +98,11 @@ def unary_cost(
     candidates : Candidates
         Their crossings in the second view.
     greys : tuple of two ndarrays, shape (H, W)
-        Grey values of both images on a common scale of 0 to 1, equal for equal brightness.
+        Grey values of both images, float32; gain and offset between them may be anything.
     axis : int
         The sweep axis.
+    others : sequence of (Camera, EdgePoints), optional
+        Further views: a candidate's world point should lie on an edge there too.
 
     Returns
     -------
@@ -101,20 +123,69 @@ def unary_cost(
         rows = candidates.select(upright)
         chain = _chain_misfit(first, rows, slope[upright], axis)
         cost[upright] = np.minimum(cost[upright], chain + UPRIGHT_PRICE)
-    return np.asarray(cost + side_cost(first, candidates, greys))
+    for camera, edges in others:
+        # a reward, not a price: what a further view does not show may be hidden there
+        cost += OTHER_WEIGHT * (_other_view(camera, edges, candidates) - HIDDEN_PX)
+    return np.asarray(cost + side_cost(first, candidates, greys, cost))
+
+
+def _other_view(camera: Camera, edges: EdgePoints, candidates: Candidates) -> FloatArray:
+    """Return the distance in px from the world point to the nearest edge of a further view."""
+    seen = camera.project(candidates.xyz_mm)
+    inside = np.isfinite(seen).all(axis=1)
+    inside &= ((seen >= 0) & (seen <= np.array(camera.size_px) - 1)).all(axis=1)
+    misfit = np.full(len(candidates), HIDDEN_PX)
+    if inside.any() and len(edges):
+        distance, _ = cKDTree(edges.xy_px).query(seen[inside], distance_upper_bound=HIDDEN_PX)
+        misfit[inside] = np.minimum(distance, HIDDEN_PX)
+    return misfit
 
 
 def side_cost(
-    first: EdgePoints, candidates: Candidates, greys: tuple[NDArray[Any], NDArray[Any]]
+    first: EdgePoints,
+    candidates: Candidates,
+    greys: tuple[NDArray[Any], NDArray[Any]],
+    cost: FloatArray,
 ) -> FloatArray:
-    """Return how much the grey of the more similar side differs, in misfit units, shape (M,)."""
+    """Return how much the grey of the more similar side differs, in misfit units, shape (M,).
+
+    Two cameras may see one surface at different brightness. Gain and offset between them are
+    fitted beforehand to the candidates that are the best of their point and good by the other
+    evidence alone.
+    """
     beside_1 = _sides(greys[0], first.xy_px, first.normal)[candidates.point]
     # across the crossed chain, towards its brighter side
     normal = np.column_stack([candidates.tangent[:, 1], -candidates.tangent[:, 0]])
     beside_2 = _sides(greys[1], candidates.xy_px, normal)
-    contrast = np.maximum(np.abs(beside_1[:, 1] - beside_1[:, 0]), LEAST_CONTRAST)
-    difference = np.abs(beside_1 - beside_2).min(axis=1) / contrast
-    return np.asarray(np.minimum(difference / SIDE_TOLERANCE, SIDE_LIMIT))
+    order = np.lexsort((cost, candidates.point))
+    best = order[np.r_[True, np.diff(candidates.point[order]) > 0]]
+    best = best[cost[best] < GOOD_PX]
+    gain, offset = _brightness(beside_1[best].ravel(), beside_2[best].ravel())
+    scale = np.ptp(np.quantile(greys[1], [0.001, 0.999]))
+    contrast = np.maximum(gain * np.abs(beside_1[:, 1] - beside_1[:, 0]), LEAST_CONTRAST * scale)
+    difference = np.sort(np.abs(gain * beside_1 + offset - beside_2), axis=1)
+    misfit = np.minimum(difference / (contrast * SIDE_TOLERANCE)[:, None], SIDE_LIMIT)
+    return np.asarray(misfit @ [1.0, FAR_WEIGHT])
+
+
+def _brightness(grey_1: FloatArray, grey_2: FloatArray) -> tuple[float, float]:
+    """Return gain and offset from the first to the second image; outliers lose their say."""
+    if grey_1.size < LEAST_PAIRS or np.ptp(grey_1) == 0.0:
+        return 1.0, 0.0
+    weight = np.ones_like(grey_1)
+    gain, offset = 1.0, float(np.median(grey_2 - grey_1))
+    for _ in range(10):
+        mean_1, mean_2 = np.average(grey_1, weights=weight), np.average(grey_2, weights=weight)
+        spread = np.average((grey_1 - mean_1) ** 2, weights=weight)
+        shared = np.average((grey_1 - mean_1) * (grey_2 - mean_2), weights=weight)
+        if spread <= 0.0 or shared <= 0.0:
+            return 1.0, 0.0
+        gain = float(shared / spread)
+        offset = float(mean_2 - gain * mean_1)
+        error = grey_2 - gain * grey_1 - offset
+        width = max(1.4826 * float(np.median(np.abs(error))), 1e-6)
+        weight = 1.0 / (1.0 + (error / (2 * width)) ** 2) ** 2
+    return gain, offset
 
 
 def _sides(grey: NDArray[Any], xy_px: FloatArray, normal: FloatArray) -> FloatArray:

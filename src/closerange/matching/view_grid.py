@@ -110,13 +110,22 @@ def sees_points(camera: Camera, xyz_mm: FloatArray, margin_px: float = 0.0) -> B
     return np.asarray(seen)
 
 
-def field_grid(cameras: Sequence[Camera], *, nodes: int, least: int, margin_px: float) -> ViewGrid:
+def field_grid(
+    cameras: Sequence[Camera],
+    *,
+    nodes: int,
+    least: int,
+    margin_px: float,
+    angle_rad: float = MIN_ANGLE_RAD,
+) -> ViewGrid:
     """Lay a grid around all that enough cameras see.
 
     Parameters
     ----------
     cameras, nodes, least, margin_px
         As in `lay_grid`.
+    angle_rad : float, optional
+        Leave out what is so far away that rays cannot cross at this angle.
 
     Returns
     -------
@@ -128,7 +137,7 @@ def field_grid(cameras: Sequence[Camera], *, nodes: int, least: int, margin_px: 
     GeometryError
         If there is no place that enough cameras see under a usable angle.
     """
-    ends, middle = _shared_rays(cameras, least)
+    ends, middle = _shared_rays(cameras, least, angle_rad)
     box = np.stack([ends.min(axis=0), ends.max(axis=0)])
     half = (box[1] - box[0]) / 2
     grid = lay_grid(cameras, box, nodes=nodes, least=least, margin_px=margin_px)
@@ -210,7 +219,9 @@ def pixel_grid(camera: Camera) -> FloatArray:
     return np.stack(grid, axis=-1).reshape(-1, 2)
 
 
-def _shared_rays(cameras: Sequence[Camera], least: int) -> tuple[FloatArray, FloatArray]:
+def _shared_rays(
+    cameras: Sequence[Camera], least: int, angle_rad: float
+) -> tuple[FloatArray, FloatArray]:
     """Return the ends (M, 3) of all pieces of rays that enough cameras see, and one inner point.
 
     Two planes of every corner of the region belong to one camera, if there are two cameras: the
@@ -219,7 +230,7 @@ def _shared_rays(cameras: Sequence[Camera], least: int) -> tuple[FloatArray, Flo
     centres = np.stack([camera.centre_mm for camera in cameras])
     baseline = float(np.linalg.norm(centres[:, None] - centres, axis=2).max())
     # sine rule: rays that cross at an angle a do so within baseline / sin(a) of either camera
-    reach = baseline / np.sin(MIN_ANGLE_RAD)
+    reach = baseline / np.sin(angle_rad)
     if not reach > 0:
         raise GeometryError(
             f"the {len(cameras)} cameras stand in one place: their rays never cross",

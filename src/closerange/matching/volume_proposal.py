@@ -30,6 +30,10 @@ best: one figure may then stand for the volume, and it does not reach where dept
 _BAND_STEP = 2.0**0.25
 """Bands of accuracy are tried in steps of a quarter of their width."""
 
+_START_ANGLES_RAD = tuple(np.deg2rad([1.0, 4.0, 16.0]))
+"""Cameras with wide lenses see far beyond where they measure well: a grid around all of that, down
+to rays that cross at 1 degree, would have its nodes too far apart to find the best place."""
+
 _SEARCH_NODES = 25
 _ROUNDS = 5
 """Each round looks closer at the best box of the one before; after five the sides are good to
@@ -71,17 +75,10 @@ def propose_volume(
     would lie as far away as the cameras see, where they see least.
     """
     cameras, count = checked_cameras(rig, least, margin_px)
-    grid = field_grid(cameras, nodes=_SEARCH_NODES, least=count, margin_px=margin_px)
-    box = _box_of(grid, _most_positions(grid))
-    for _ in range(_ROUNDS - 1):
-        around = np.stack([box[0] - 2 * grid.cell_mm, box[1] + 2 * grid.cell_mm])
-        closer = lay_grid(cameras, around, nodes=_SEARCH_NODES, least=count, margin_px=margin_px)
-        if not closer.inside.any():
-            break
-        grid, box = closer, _box_of(closer, _most_positions(closer))
+    box, cell_mm = _best_start(cameras, count, margin_px)
     for _ in range(_SHRINKS):
         if _fits(cameras, box, count, margin_px):
-            box = _grown(cameras, box, grid.cell_mm, count, margin_px)
+            box = _grown(cameras, box, cell_mm, count, margin_px)
             return _rounded_inwards(box)
         middle = box.mean(axis=0)
         box = middle + _SHRINK * (box - middle)
@@ -133,6 +130,40 @@ def check_in_view(rig: Rig | Sequence[Camera], volume_mm: ArrayLike) -> None:
             "no place of the volume is seen by two cameras",
             remedy="move the limits of the volume to where the fields of view overlap",
         )
+
+
+def _best_start(
+    cameras: Sequence[Camera], least: int, margin_px: float
+) -> tuple[FloatArray, FloatArray]:
+    """Search from afar and from near; return the box with most positions and its grid's cell."""
+    found: list[tuple[float, FloatArray, FloatArray]] = []
+    for angle in _START_ANGLES_RAD:
+        try:
+            grid = field_grid(
+                cameras,
+                nodes=_SEARCH_NODES,
+                least=least,
+                margin_px=margin_px,
+                angle_rad=angle,
+            )
+        except GeometryError:
+            if not found:
+                raise
+            break  # nothing is seen so near
+        box = _box_of(grid, _most_positions(grid))
+        for _ in range(_ROUNDS - 1):
+            around = np.stack([box[0] - 2 * grid.cell_mm, box[1] + 2 * grid.cell_mm])
+            closer = lay_grid(
+                cameras, around, nodes=_SEARCH_NODES, least=least, margin_px=margin_px
+            )
+            if not closer.inside.any():
+                break
+            grid, box = closer, _box_of(closer, _most_positions(closer))
+        inner = lay_grid(cameras, box, nodes=_CHECK_NODES, least=least, margin_px=margin_px)
+        density = 1 / np.sqrt(np.linalg.det(inner.cov_px[inner.inside]))
+        found.append((float(density.sum() * np.prod(inner.cell_mm)), box, grid.cell_mm))
+    _, box, cell_mm = max(found, key=lambda item: item[0])
+    return box, cell_mm
 
 
 def _most_positions(grid: ViewGrid) -> Slices:

@@ -15,8 +15,10 @@ from closerange.geometry.covariance import propagate
 from closerange.geometry.intersection import widest_angle
 from closerange.position.observed import Observed, arrange
 from closerange.position.positions import Positions
+from closerange.position.suspicion import Doubt, DoubtWarning, find_doubt
 from closerange.position.triangulate import Solution, solve_points, triangulate_linear
 from closerange.rig.disc_bias import DiscViews, disc_centre_bias
+from closerange.rig.observations import EXCLUDING
 from closerange.rig.rig import Rig
 
 MIN_ANGLE_RAD = np.deg2rad(1.0)
@@ -25,12 +27,8 @@ MIN_ANGLE_RAD = np.deg2rad(1.0)
 RESIDUAL_FALSE_ALARM = 1e-4
 """Chance that a good point is flagged for its residual."""
 
-MISSING_SHARE = 0.2
-"""Share of points with a large residual above which the rig is suspected, not the points: wrong
-pairs are rarer. Exchanged cameras of a symmetric pair give less than half."""
-
-MISSING_POINTS = 3
-"""Fewer points with a large residual may be chance blunders."""
+CONTRADICTING = Flag.residual | Flag.behind_camera | Flag.not_converged
+"""What true points in a true rig never show: the rays miss, or meet where no camera looks."""
 
 OUTSIDE_SIGMA = 3.0
 """A point counts as outside the volume when it is so by more than its own uncertainty."""
@@ -45,7 +43,8 @@ def measure_points(rig: Rig, points: ImagePoints) -> Positions:
         Calibrated cameras.
     points : ImagePoints
         Rows of one (placement, reading, point) in several cameras belong together. Rows without
-        a covariance get that of the calibration, s^2 I.
+        a covariance get that of the calibration, s^2 I; others are believed but for tau^2 I, what
+        such covariances left out in the calibration.
 
     Returns
     -------
@@ -58,6 +57,14 @@ def measure_points(rig: Rig, points: ImagePoints) -> Positions:
     InputError
         If a camera is not in the rig, or a point lies outside of its image.
 
+    Warns
+    -----
+    DoubtWarning
+        If most points contradict the rig, or exchanged cameras or another image size explain why
+        many do: `Positions.doubt` then says the same.
+    CloseRangeWarning
+        If many points contradict it.
+
     Notes
     -----
     Equations (2.9) to (2.11) and (5.6), then weighted reprojection error minimised by
@@ -68,13 +75,14 @@ def measure_points(rig: Rig, points: ImagePoints) -> Positions:
     observed = arrange(rig, points)
     observed = _without_disc_bias(rig, observed)
     solution = solve_points(rig, observed.xy_px, observed.cov_px2, observed.used)
-    flags = observed.flags | _geometry_flags(rig, observed, solution)
-    if not rig.trusted:
-        flags = flags | Flag.untrusted
-    squares = np.where(observed.used[:, :, None], solution.residual_px, 0.0) ** 2
-    used = observed.used.sum(axis=1)
-    rms = np.sqrt(squares.sum(axis=(1, 2)) / np.maximum(2 * used, 1))
-    _warn_if_rays_miss(rig, flags, rms)
+    found = _geometry_flags(rig, observed, solution)
+    rms = _rms(observed, solution)
+    doubt = _doubt(rig, points, observed, found, rms)
+    if doubt is not None:
+        warnings.warn(
+            doubt.text, DoubtWarning if doubt.grave else CloseRangeWarning, stacklevel=2
+        )
+    flags = observed.flags | found | (0 if rig.trusted else int(Flag.untrusted))
     defined = all_finite(solution.xyz_mm, 1)
     return Positions(
         placement=observed.placement,
@@ -83,11 +91,31 @@ def measure_points(rig: Rig, points: ImagePoints) -> Positions:
         xyz_mm=solution.xyz_mm,
         cov_mm2=solution.image_cov_mm2 + solution.calibration_cov_mm2,
         residual_px=np.where(defined, rms, np.nan),
-        cameras=used,
+        cameras=observed.used.sum(axis=1),
         flags=flags,
-        dof=None if observed.own_cov else rig.dof,
+        dof=_dof(rig, observed),
         noise_cov_mm2=_noise(observed, solution),
+        doubt=doubt.text if doubt is not None and doubt.grave else "",
     )
+
+
+def _rms(observed: Observed, solution: Solution) -> FloatArray:
+    """Return the residual of each point: root of the mean square over the views that take part."""
+    squares = np.where(observed.used[:, :, None], solution.residual_px, 0.0) ** 2
+    used = observed.used.sum(axis=1)
+    rms: FloatArray = np.sqrt(squares.sum(axis=(1, 2)) / np.maximum(2 * used, 1))
+    return rms
+
+
+def _dof(rig: Rig, observed: Observed) -> int | None:
+    """Return how well the variance is known: as well as that of the residuals it comes from.
+
+    Where tau fills up what was stated to the variance that the calibration's residuals showed,
+    the sum is as uncertain as that variance; where it is 0 the statements stand on their own.
+    """
+    if (observed.own_cov and rig.tau_px == 0) or rig.dof < 1:
+        return None
+    return rig.dof
 
 
 def _noise(observed: Observed, solution: Solution) -> FloatArray:
@@ -116,13 +144,16 @@ def _geometry_flags(rig: Rig, observed: Observed, solution: Solution) -> IntArra
     parallel = ~too_few & (widest_angle(directions, used) < MIN_ANGLE_RAD)
     depths = np.stack([camera.depth_mm(xyz) for camera in rig.cameras], axis=1)
     behind = (used & (depths <= 0)).any(axis=1)
-    undefined = ~too_few & ~parallel & ~behind & ~all_finite(xyz, 1)
+    # a view without a residual did not take part in the answer, whatever the answer looks like
+    lost = (used & ~all_finite(solution.residual_px, 2)).any(axis=1)
+    explained = behind | (parallel & ~all_finite(xyz, 1))
+    unfinished = ~too_few & lost & ~explained
     flags = np.zeros(len(xyz), dtype=np.int64)
     for rows, flag in (
         (too_few, Flag.single_view),
         (parallel, Flag.near_parallel),
         (behind, Flag.behind_camera),
-        (undefined, Flag.not_converged),
+        (unfinished, Flag.not_converged),
         (_outside(rig, solution), Flag.outside_volume),
         (_rays_miss(rig, observed, solution), Flag.residual),
     ):
@@ -146,7 +177,8 @@ def _rays_miss(rig: Rig, observed: Observed, solution: Solution) -> BoolArray:
     """
     from scipy.stats import chi2  # noqa: PLC0415  # takes half a second: only when measuring
 
-    cov = observed.cov_px2 + solution.predicted_px2 + rig.noise_px**2 * np.eye(2)
+    misfit = max(rig.noise_px**2 - rig.tau_px**2, 0.0)  # tau is in the points' covariance already
+    cov = observed.cov_px2 + solution.predicted_px2 + misfit * np.eye(2)
     used = observed.used & all_finite(solution.residual_px, 2)
     cov = np.where(used[..., None, None], cov, np.eye(2))
     residual = np.where(used[..., None], solution.residual_px, 0.0)
@@ -156,13 +188,34 @@ def _rays_miss(rig: Rig, observed: Observed, solution: Solution) -> BoolArray:
     return np.asarray((dof > 0) & (squared > limit))
 
 
-def _warn_if_rays_miss(rig: Rig, flags: IntArray, rms: FloatArray) -> None:
-    missing = (flags & int(Flag.residual)) != 0
-    if missing.sum() >= MISSING_POINTS and missing.mean() > MISSING_SHARE:
-        warnings.warn(
-            f"the rays of {int(missing.sum())} of {len(flags)} points miss each other by "
-            f"{np.median(rms[missing]):.2f} px rms, the calibration left {rig.noise_px:.3f} px: a "
-            "camera was moved, the cameras are exchanged or this is another rig's file",
-            CloseRangeWarning,
-            stacklevel=3,
-        )
+def _doubt(
+    rig: Rig, points: ImagePoints, observed: Observed, found: IntArray, rms_px: FloatArray
+) -> Doubt | None:
+    """Ask whether the points that should be measurable contradict the rig."""
+    contradicts = _contradicts(observed, found)
+    rows = contradicts & np.isfinite(rms_px)
+    return find_doubt(
+        rig,
+        points,
+        contradicts[_measurable(observed)],
+        float(np.median(rms_px[rows])) if rows.any() else np.nan,
+        _contradictions,
+    )
+
+
+def _contradictions(rig: Rig, points: ImagePoints) -> BoolArray:
+    """Tell which measurable points contradict the rig."""
+    observed = _without_disc_bias(rig, arrange(rig, points))
+    solution = solve_points(rig, observed.xy_px, observed.cov_px2, observed.used)
+    contradicts = _contradicts(observed, _geometry_flags(rig, observed, solution))
+    return contradicts[_measurable(observed)]
+
+
+def _measurable(observed: Observed) -> BoolArray:
+    """Tell which points two views see of which nothing says that they are displaced."""
+    displaced = (observed.flags & int(EXCLUDING)) != 0
+    return np.asarray((observed.used.sum(axis=1) >= 2) & ~displaced)
+
+
+def _contradicts(observed: Observed, found: IntArray) -> BoolArray:
+    return np.asarray(_measurable(observed) & ((found & int(CONTRADICTING)) != 0))

@@ -8,6 +8,7 @@ import numpy as np
 
 from closerange.errors import InputError
 from closerange.features.image_points import ImagePoints
+from closerange.flags import Flag
 from closerange.geometry.arrays import BoolArray, FloatArray, IntArray, all_finite
 from closerange.rig.rig import Rig
 
@@ -21,9 +22,10 @@ class Observed:
     placement, reading, point : tuple of str
         Names of the M points, in the order of their first row.
     xy_px : ndarray, shape (M, C, 2)
-        Observed px; NaN where not seen.
+        Observed px; NaN where not seen, or where the lens model has no answer.
     cov_px2 : ndarray, shape (M, C, 2, 2)
-        Covariance; that of the rig where none was given.
+        C + tau^2 I: what was stated and what the calibration found that such statements leave
+        out; s^2 I of the rig where nothing was stated.
     noise_cov_px2 : ndarray, shape (M, C, 2, 2)
         The part that differs between readings; NaN where it was not given.
     used : ndarray of bool, shape (M, C)
@@ -35,7 +37,7 @@ class Observed:
     diameter_mm : ndarray, shape (M,)
         True disc diameters; NaN where none.
     own_cov : bool
-        Whether any covariance was given with the points.
+        Whether every view that takes part came with a covariance.
     """
 
     placement: tuple[str, ...]
@@ -55,7 +57,8 @@ def arrange(rig: Rig, points: ImagePoints) -> Observed:
     """Arrange image points by world point and camera.
 
     Flagged views are left out of a point that at least two unflagged ones see; otherwise they
-    take part and the position carries their flags.
+    take part and the position carries their flags. A view that the lens model cannot undistort
+    tells no direction: it is left out and the position says so.
 
     Parameters
     ----------
@@ -94,11 +97,16 @@ def arrange(rig: Rig, points: ImagePoints) -> Observed:
     flags[rows, columns] = points.flags
     xy = table(points.xy_px, 2)
     found = all_finite(xy, 2)
-    used = _used(found, flags)
+    beyond = found & ~_undistorted(rig, xy)
+    xy[beyond] = np.nan
+    used = _used(found & ~beyond, flags)
     cov = table(points.cov_px2, 2, 2)
     unknown = ~all_finite(cov, (2, 3))
+    cov += rig.tau_px**2 * np.eye(2)
     cov[unknown] = rig.noise_px**2 * np.eye(2)
-    carried = np.where(used | (used.sum(axis=1) < 2)[:, None], flags, 0)
+    missed = beyond & (flags == 0)  # would have taken part
+    flags[beyond] |= int(Flag.beyond_lens)
+    carried = np.where(used | missed | (used.sum(axis=1) < 2)[:, None], flags, 0)
     diameters = table(points.disc_diameter_mm)
     known = np.isfinite(diameters)
     return Observed(
@@ -114,8 +122,14 @@ def arrange(rig: Rig, points: ImagePoints) -> Observed:
         diameter_mm=np.where(
             known.any(axis=1), np.where(known, diameters, -np.inf).max(axis=1, initial=-1.0), np.nan
         ),
-        own_cov=bool((~unknown & used).any()),
+        own_cov=bool(used.any() and not (unknown & used).any()),
     )
+
+
+def _undistorted(rig: Rig, xy_px: FloatArray) -> BoolArray:
+    """Tell which views the lens models can undistort, shape (M, C)."""
+    ideal = [camera.undistort(xy_px[:, i]) for i, camera in enumerate(rig.cameras)]
+    return all_finite(np.stack(ideal, axis=1), 2)
 
 
 def _used(found: BoolArray, flags: IntArray) -> BoolArray:

@@ -34,10 +34,14 @@ class Positions:
         Repeated measurement of the same placement; blank when there is only one.
     dof : int or None
         Degrees of freedom of the variance behind `cov_mm2`; None when the covariances of the
-        image points were given. A 95 % region is ``e' cov^-1 e <= 3 F(0.95; 3, dof)``.
+        image points were given and nothing was added to them. A 95 % region is
+        ``e' cov^-1 e <= 3 F(0.95; 3, dof)``.
     noise_cov_mm2 : ndarray, shape (M, 3, 3)
         The part of `cov_mm2` that differs between readings of a still scene, mm^2; NaN where
         unknown.
+    doubt : str
+        Why most of the image points cannot be those of the rig; empty where nothing says so. Not
+        a part of the table.
     """
 
     placement: tuple[str, ...]
@@ -50,6 +54,7 @@ class Positions:
     reading: tuple[str, ...]
     dof: int | None = None
     noise_cov_mm2: FloatArray = field(default_factory=lambda: np.array(np.nan))
+    doubt: str = ""
 
     def __post_init__(self) -> None:
         count = len(self.point)
@@ -101,6 +106,7 @@ class Positions:
             reading=texts(self.reading),
             dof=self.dof,
             noise_cov_mm2=self.noise_cov_mm2[index],
+            doubt=self.doubt,
         )
 
     def to_csv(self, path: Path | str) -> None:

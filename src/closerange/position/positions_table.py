@@ -23,16 +23,19 @@ from closerange.position.positions import Positions
 REQUIRED = ("placement", "point", "x_mm", "y_mm", "z_mm")
 COVARIANCE = ("cov_xx_mm2", "cov_xy_mm2", "cov_xz_mm2", "cov_yy_mm2", "cov_yz_mm2", "cov_zz_mm2")
 NOISE = tuple(name.replace("cov", "noise") for name in COVARIANCE)
-OPTIONAL = (*COVARIANCE, *NOISE, "residual_px", "cameras", "flags", "reading")
+OPTIONAL = (*COVARIANCE, *NOISE, "residual_px", "cameras", "flags", "reading", "dof")
 
 MAX_CAMERAS = 1_000_000
 """Largest count of cameras read: far beyond any rig, and a whole number in every type."""
+
+MAX_DOF = 2**53
+"""Largest number of degrees of freedom read: what a float holds exactly, as in the rig file."""
 
 _UPPER = np.triu_indices(3)
 
 
 def write_positions(positions: Positions, path: Path | str) -> None:
-    """Write a positions table; columns of readings and of noise only if there is any.
+    """Write a positions table; columns of readings, noise and dof only if there is any.
 
     Parameters
     ----------
@@ -58,6 +61,8 @@ def write_positions(positions: Positions, path: Path | str) -> None:
     columns["residual_px"] = [float_text(value) for value in positions.residual_px]
     columns["cameras"] = [str(count) for count in positions.cameras]
     columns["flags"] = [format_flags(int(flag)) for flag in positions.flags]
+    if positions.dof is not None:
+        columns["dof"] = [str(positions.dof)] * len(positions)
     write_csv(path, list(columns), zip(*columns.values(), strict=True))
 
 
@@ -78,7 +83,8 @@ def read_positions(path: Path | str) -> Positions:
     Returns
     -------
     Positions
-        Its rows; `dof` is unknown.
+        Its rows. Where rows state different `dof`, as in tables joined by hand, the smallest counts:
+        regions then err on the large side.
 
     Raises
     ------
@@ -107,6 +113,7 @@ def read_positions(path: Path | str) -> Positions:
         cameras=_counts(table),
         flags=np.array(flags, dtype=np.int64),
         noise_cov_mm2=_covariances(table, NOISE),
+        dof=_dof(table),
     )
 
 
@@ -140,10 +147,24 @@ def _covariances(table: CsvTable, names: tuple[str, ...]) -> FloatArray:
 
 def _counts(table: CsvTable) -> IntArray:
     counts = table.floats("cameras", blank=0.0)
-    for row, count in enumerate(counts):
-        if not 0 <= count <= MAX_CAMERAS or count != int(count):
-            raise TableError(
-                f"{table.where(row, 'cameras')}: {count} is not a number of cameras",
-                remedy=f"write a whole number from 0 to {MAX_CAMERAS}",
-            )
+    _check_whole(table, "cameras", counts, (0, MAX_CAMERAS), "number of cameras")
     return np.array(counts, dtype=np.int64)
+
+
+def _dof(table: CsvTable) -> int | None:
+    values = table.floats("dof", blank=np.nan)
+    stated = [value for value in values if not np.isnan(value)]
+    _check_whole(table, "dof", values, (1, MAX_DOF), "number of degrees of freedom")
+    return int(min(stated)) if stated else None
+
+
+def _check_whole(
+    table: CsvTable, column: str, values: list[float], bounds: tuple[int, int], what: str
+) -> None:
+    """Refuse what is not a whole number within bounds; a blank cell is allowed."""
+    for row, value in enumerate(values):
+        if not np.isnan(value) and (not bounds[0] <= value <= bounds[1] or value != int(value)):
+            raise TableError(
+                f"{table.where(row, column)}: {value} is not a {what}",
+                remedy=f"write a whole number from {bounds[0]} to {bounds[1]}",
+            )

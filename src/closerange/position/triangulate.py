@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from closerange.geometry.arrays import BoolArray, FloatArray, all_finite
-from closerange.geometry.covariance import propagate
+from closerange.geometry.covariance import positive_definite, propagate
 from closerange.geometry.intersection import intersect_linear
 from closerange.rig.rig import Rig
 
@@ -117,9 +117,12 @@ def solve_points(rig: Rig, xy_px: FloatArray, cov_px2: FloatArray, used: BoolArr
     Returns
     -------
     Solution
-        Positions and covariances; NaN where two rays do not define a point.
+        Positions and covariances; NaN where two rays do not define a point. Points of which a
+        view has no covariance are solved with equal weights, and their covariance is NaN.
     """
     start = triangulate_linear(rig, xy_px, used)
+    known = (positive_definite(cov_px2.reshape(-1, 2, 2)).reshape(used.shape) | ~used).all(axis=1)
+    cov_px2 = np.where((known[:, None] & used)[..., None, None], cov_px2, np.eye(2))
     refined = refine(rig, start, xy_px, cov_px2, used)
     residual, jacobian = _views(rig, refined, xy_px, used)
     weight = np.linalg.inv(cov_px2)
@@ -132,6 +135,7 @@ def solve_points(rig: Rig, xy_px: FloatArray, cov_px2: FloatArray, used: BoolArr
     sensitivity = -image_cov @ (weighted @ by_parameter).sum(axis=1)
     seen = np.where(used[:, :, None], residual, np.nan)
     calibration_cov = propagate(sensitivity, rig.parameter_cov)
+    image_cov = np.where(known[:, None, None], image_cov, np.nan)
     return Solution(refined, seen, image_cov, calibration_cov, by_image, predicted)
 
 

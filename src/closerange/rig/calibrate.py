@@ -20,6 +20,7 @@ from closerange.rig.diagnosis import (
     explain_camera,
     explain_placement,
 )
+from closerange.rig.excess import unstated_px
 from closerange.rig.findings import (
     bias_report,
     bounding_box,
@@ -118,6 +119,7 @@ def calibrate_rig(
         ),
         parameter_cov=covariance,
         noise_px=solution.noise_px,
+        tau_px=unstated_px(observations, solution.cameras, kept, xy, solution.dof),
         dof=solution.dof,
         model=solution.model.name,
         residuals=residual_table(observations, solution.cameras, kept, xy),

@@ -122,11 +122,12 @@ def warn_of(report: dict[str, Any]) -> None:
             f"{len(outliers)} outliers are left out of the fit: {listed(names)}"
             + (f" ({'; '.join(hints[:3])})" if hints else "")
         )
-    gaps = report["weights"]["points"] - report["weights"]["points_with_covariance"]
-    if 0 < gaps < report["weights"]["points"]:
+    count = report["weights"]["points"]
+    gaps = count - report["weights"]["points_with_covariance"]
+    if 0 < gaps < count and report["weights"]["chi_square_per_dof"] is not None:
         texts.append(
-            f"{gaps} of {report['weights']['points']} points have no covariance: they are weighed "
-            "with the median of their camera's"
+            f"{gaps} of {count} points have no covariance: they are weighed with the median of "
+            "their camera's; state it for all points or for none"
         )
     for name, entry in report["cameras"].items():
         if entry["s_px"] > BAD_PX:

@@ -112,3 +112,21 @@ def take_apart(columns: FloatArray) -> Factors:
         condition=float(singular[0] / safe[-1]),
         indistinct=vt[~(singular * MAX_CONDITION > singular[0])],
     )
+
+
+def inner_variance(square: FloatArray, dof: int) -> float:
+    """Return the variance of one coordinate by the better half of the points.
+
+    Parameters
+    ----------
+    square : ndarray, shape (N,)
+        Squared whitened residuals, both coordinates together.
+    dof : int
+        Of the fit.
+
+    Returns
+    -------
+    float
+        From the median: squares of two Gaussians are exponential.
+    """
+    return float(np.median(square) / (2 * np.log(2)) * 2 * len(square) / max(dof, 1))

@@ -62,7 +62,12 @@ def fit_report(
         "model": name,
         "noise_px": solution.noise_px,
         "dof": solution.dof,
-        "weights": _weights_report(observations, solution),
+        "weights": describe_weights(
+            observations,
+            tau_px=solution.tau_px,
+            chi_square_per_dof=solution.chi_square / solution.dof if solution.weighted else None,
+            linear=name in LINEAR,
+        ),
         "left_out": left_out(observations),
         "cameras": cameras,
     }
@@ -111,32 +116,25 @@ def describe_parameters(camera: Camera, model: Model, std: FloatArray) -> dict[s
     return {**free, **fixed}
 
 
-def _weights_report(observations: Observations, solution: Solution) -> dict[str, Any]:
-    linear = solution.model.name in LINEAR
-    words = "unit weights: the method knows no others" if linear else ""
-    chi_square = solution.chi_square / solution.dof if solution.weighted else None
-    return describe_weights(observations, solution.tau_px, chi_square, words)
-
-
 def describe_weights(
-    observations: Observations, tau_px: float, chi_square_per_dof: float | None, words: str = ""
+    observations: Observations, *, tau_px: float, chi_square_per_dof: float | None, linear: bool
 ) -> dict[str, Any]:
-    """Describe how points were weighed, JSON-ready; no chi^2 means unit weights."""
-    cov = observations.points.cov_px2[observations.usable]
-    known = np.isfinite(cov[:, 0, 0])
-    if words:
-        pass
+    """Describe how points were weighed, JSON-ready; no chi^2 where the weights are all one."""
+    known = np.isfinite(observations.points.cov_px2[observations.usable, 0, 0])
+    if linear:
+        words = "unit weights: the method knows no others"
     elif chi_square_per_dof is None:
         words = "unit weights: neither covariances nor std_mm are stated"
     else:
         words = (
-            "inverse of C + tau^2 I + std_mm^2 J J': stated covariances, a common part, and the "
-            "control positions' errors; tau makes chi^2 equal to its degrees of freedom"
+            "inverse of C + tau^2 I + std_mm^2 J J': stated covariances (for points without one, "
+            "the median of their camera's), a common part, and the control positions' errors; tau "
+            "makes chi^2 equal to its degrees of freedom"
         )
     return {
         "rule": words,
         "points_with_covariance": int(np.count_nonzero(known)),
-        "points": len(cov),
+        "points": len(known),
         "tau_px": tau_px,
         "chi_square_per_dof": chi_square_per_dof,
     }

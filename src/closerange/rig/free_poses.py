@@ -1,57 +1,39 @@
 """Calibration from placements in unknown poses: a target that is simply held up.
 
 The control points are given in the target's frame; the world frame is the target's frame in
-the first placement. Starting values come from OpenCV (Zhang's method), then cameras and
-placements are adjusted together.
+the first placement. Points are joined, weighed, tested and corrected as in placements of known
+poses; only the fit differs: cameras and placements are adjusted together.
 """
 
 from __future__ import annotations
 
-from collections import Counter
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
 from typing import Any
 
-import cv2
 import numpy as np
+from numpy.typing import ArrayLike
 
-from closerange.errors import GeometryError, InputError
+from closerange.errors import InputError
 from closerange.features.control import ControlPoints
 from closerange.features.image_points import ImagePoints
-from closerange.geometry.arrays import FloatArray, IntArray
-from closerange.geometry.least_squares import levenberg_marquardt
-from closerange.geometry.transform import RigidTransform, rotation_from_vector
-from closerange.rig.camera import POSE, Camera
-from closerange.rig.distortion import BrownIdeal
-from closerange.rig.models import FREE, model_named
-from closerange.rig.projector import left_jacobian
-from closerange.rig.rig import Residuals, Rig
+from closerange.geometry.arrays import FloatArray
+from closerange.rig.bundle_solution import BundleSolution, place, solve_bundle
+from closerange.rig.excess import unstated_px
+from closerange.rig.findings import (
+    bias_report,
+    bounding_box,
+    checked_volume,
+    discordant,
+    residual_table,
+    warn_of,
+)
+from closerange.rig.fit_report import describe_parameters, describe_weights, left_out
+from closerange.rig.models import FREE, Model, model_named
+from closerange.rig.observations import Observations, join
+from closerange.rig.outlier_hints import describe_outliers
+from closerange.rig.rig import Rig
 
-MIN_POINTS = 6
-"""Points that a camera must see of a placement to use it."""
-
-MIN_PLACEMENTS = 3
-"""Placements that a plane needs for focal length and principal point (Zhang 2000,
-doi:10.1109/34.888718)."""
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class _Views:
-    """Usable rows: N points with camera and placement indices."""
-
-    cameras: tuple[str, ...]
-    placements: tuple[str, ...]
-    points: ImagePoints
-    camera: IntArray
-    placement: IntArray
-    xyz_mm: FloatArray  # in the target's frame
-
-    def rows(self, camera: int, placement: int | None = None) -> IntArray:
-        """Return the rows of a camera, or of a camera and a placement."""
-        chosen = self.camera == camera
-        if placement is not None:
-            chosen = chosen & (self.placement == placement)
-        return np.flatnonzero(chosen)
+METHOD = "least squares in the image (Levenberg-Marquardt), cameras and placements together"
 
 
 def calibrate_free_poses(
@@ -60,32 +42,44 @@ def calibrate_free_poses(
     size_px: Mapping[str, tuple[int, int]],
     *,
     model: str = "brown",
+    volume_mm: ArrayLike | None = None,
 ) -> Rig:
     """Calibrate cameras from placements of a target in unknown poses.
 
     Parameters
     ----------
     points : ImagePoints
-        Image points; at least three differently tilted placements for each camera.
+        Image points; at least three differently tilted placements for each camera. Flags of
+        `observations.EXCLUDING` keep a row out of the fit.
     control : ControlPoints
-        Points in the target's frame, mm, without placements.
+        Points in the target's frame, mm, without placements; rows marked as check stay out of
+        the fit.
     size_px : mapping of str to (int, int)
         Width and height of each camera's images.
     model : str, optional
         Free parameters of each camera; ``auto`` means ``brown`` here.
+    volume_mm : array_like, shape (2, 3), optional
+        Measuring volume in the world; the bounding box of the points in all placements, without
+        it.
 
     Returns
     -------
     Rig
-        Cameras in the target's frame of the first placement; `volume_mm` is the bounding box of
-        all points.
+        Cameras in the target's frame of the first placement, not yet judged.
 
     Raises
     ------
     InputError
-        If the model is a linear one, or an image size is missing.
+        If an option or table cannot be used: a linear model, a missing image size, points outside
+        of the image, a volume upside down.
     GeometryError
-        If there are too few placements or a camera cannot be linked to the first placement.
+        If there are too few placements, a camera cannot be linked to the first placement, or most
+        points of an image contradict the others.
+
+    Warns
+    -----
+    CloseRangeWarning
+        Of points without control, placements that are left out, outliers and large residuals.
     """
     name = "brown" if model == "auto" else model
     if name not in FREE:
@@ -93,266 +87,80 @@ def calibrate_free_poses(
             f"model {model!r} cannot be used with free poses",
             remedy=f"use one of {', '.join(FREE)}",
         )
-    free = model_named(name).free
-    views = _join(points, control, size_px)
-    cameras, poses = _start(views, size_px, free)
-    return _adjust(views, cameras, poses, name)
-
-
-def _join(
-    points: ImagePoints, control: ControlPoints, size_px: Mapping[str, tuple[int, int]]
-) -> _Views:
-    row = control.rows_of(points)
-    usable = points.found & (row >= 0) & (points.flags == 0)
-    pairs = list(zip(points.camera, points.placement, strict=True))
-    counts = Counter(pair for pair, good in zip(pairs, usable, strict=True) if good)
-    usable &= np.array([counts[pair] >= MIN_POINTS for pair in pairs], dtype=bool)
-    kept, row = points.select(usable), row[usable]
-    missing = [camera for camera in kept.cameras if camera not in size_px]
-    if missing:
-        raise InputError(
-            f"the image size of camera {missing[0]!r} is not known",
-            remedy=f"add --image-size {missing[0]}=WxH",
-        )
-    cameras = points.cameras  # one without usable points is named below, not dropped
-    if not cameras:
-        raise GeometryError("there are no image points", remedy="detect the target first")
-    placements = tuple(dict.fromkeys(kept.placement))
-    camera = np.array([cameras.index(name) for name in kept.camera], dtype=np.int64)
-    index = {name: i for i, name in enumerate(placements)}
-    placement = np.array([index[name] for name in kept.placement], dtype=np.int64)
-    views = _Views(cameras, placements, kept, camera, placement, control.xyz_mm[row])
-    for i, name in enumerate(cameras):
-        if len(_good_placements(views, i)) < MIN_PLACEMENTS:
-            raise GeometryError(
-                f"camera {name!r} sees {len(_good_placements(views, i))} placements with "
-                f"{MIN_POINTS} points or more; {MIN_PLACEMENTS} are needed",
-                remedy="show the target in more, differently tilted poses",
-            )
-    return views
-
-
-def _good_placements(views: _Views, camera: int) -> list[int]:
-    counts = np.bincount(views.placement[views.rows(camera)], minlength=len(views.placements))
-    return [int(i) for i in np.flatnonzero(counts >= MIN_POINTS)]
-
-
-def _start(
-    views: _Views, size_px: Mapping[str, tuple[int, int]], free: tuple[str, ...]
-) -> tuple[list[Camera], list[RigidTransform]]:
-    """Return cameras and world_from_target of each placement, linked through shared placements."""
-    seen: list[dict[int, RigidTransform]] = []  # camera_from_target by placement
-    cameras: list[Camera] = []
-    for i, name in enumerate(views.cameras):
-        camera, poses = _mono(views, i, size_px[name], free)
-        cameras.append(camera)
-        seen.append(poses)
-    world: dict[int, RigidTransform] = {0: RigidTransform(np.eye(3), np.zeros(3))}
-    placed: dict[int, RigidTransform] = {}
-    while len(placed) < len(cameras):
-        ready = [
-            i for i in range(len(cameras)) if i not in placed and seen[i].keys() & world.keys()
-        ]
-        if not ready:
-            lost = next(i for i in range(len(cameras)) if i not in placed)
-            raise GeometryError(
-                f"camera {views.cameras[lost]!r} shares no placement with the other cameras",
-                remedy="show the target where this camera and another one see it together",
-            )
-        i = ready[0]
-        link = min(seen[i].keys() & world.keys())
-        placed[i] = seen[i][link].after(world[link].inverse())
-        for placement, pose in seen[i].items():
-            world.setdefault(placement, placed[i].inverse().after(pose))
-    located = [replace(camera, camera_from_world=placed[i]) for i, camera in enumerate(cameras)]
-    return located, [world[i] for i in range(len(views.placements))]
-
-
-def _mono(
-    views: _Views, camera: int, size_px: tuple[int, int], free: tuple[str, ...]
-) -> tuple[Camera, dict[int, RigidTransform]]:
-    """Calibrate one camera by OpenCV, as a start."""
-    placements = _good_placements(views, camera)
-    rows = [views.rows(camera, placement) for placement in placements]
-    flags = 0 if "k3" in free else cv2.CALIB_FIX_K3
-    flags |= 0 if "p1" in free else cv2.CALIB_ZERO_TANGENT_DIST
-    flags |= 0 if "k2" in free else cv2.CALIB_FIX_K2
-    flags |= 0 if "k1" in free else cv2.CALIB_FIX_K1
-    name = views.cameras[camera]
-    try:
-        _, matrix, lens, turns, shifts = cv2.calibrateCamera(
-            [views.xyz_mm[row].astype(np.float32) for row in rows],
-            [views.points.xy_px[row].astype(np.float32) for row in rows],
-            size_px,
-            None,
-            None,
-            flags=flags,
-        )
-    except cv2.error as error:
-        raise GeometryError(
-            f"camera {name!r}: no starting values can be found from these placements",
-            remedy="show a flat target in differently tilted poses",
-        ) from error
-    k1, k2, p1, p2, k3 = np.ravel(lens)[:5]
-    poses = {
-        placement: RigidTransform(rotation_from_vector(np.ravel(turn)), np.ravel(shift))
-        for placement, turn, shift in zip(placements, turns, shifts, strict=True)
-    }
-    identity = RigidTransform(np.eye(3), np.zeros(3))
-    brown = BrownIdeal(float(k1), float(k2), float(p1), float(p2), float(k3))
-    return Camera(name, size_px, matrix, identity, brown), poses
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class _Bundle:
-    """The adjustment: all cameras and all placements but the first, which is the world."""
-
-    views: _Views
-    cameras: list[Camera]
-    poses: list[RigidTransform]
-    free: tuple[str, ...]
-
-    @property
-    def count(self) -> int:
-        """Number of parameters."""
-        return len(self.free) * len(self.cameras) + 6 * (len(self.poses) - 1)
-
-    def at(self, x: FloatArray) -> _Bundle:
-        """Return the state with changes added to all parameters."""
-        width = len(self.free)
-        cameras = [
-            camera.moved(dict(zip(self.free, x[i * width : (i + 1) * width], strict=True)))
-            for i, camera in enumerate(self.cameras)
-        ]
-        turns = x[width * len(cameras) :].reshape(-1, 6)
-        poses = [self.poses[0]]
-        for pose, change in zip(self.poses[1:], turns, strict=True):
-            rotation = rotation_from_vector(change[:3]) @ pose.rotation
-            poses.append(RigidTransform(rotation, pose.translation_mm + change[3:]))
-        return _Bundle(self.views, cameras, poses, self.free)
-
-    def world_mm(self) -> FloatArray:
-        """Return each row's point in the world."""
-        world = np.empty_like(self.views.xyz_mm)
-        for i, pose in enumerate(self.poses):
-            rows = self.views.placement == i
-            world[rows] = pose.apply(self.views.xyz_mm[rows])
-        return world
-
-    def residuals(self) -> FloatArray:
-        """Return observed minus calculated, (N, 2)."""
-        world, xy = self.world_mm(), self.views.points.xy_px
-        residual = np.empty_like(xy)
-        for i, camera in enumerate(self.cameras):
-            rows = self.views.rows(i)
-            residual[rows] = xy[rows] - camera.project(world[rows])
-        return residual
-
-    def jacobian(self) -> FloatArray:
-        """Return d calculated / d parameters, (2N, P)."""
-        world = self.world_mm()
-        full = np.zeros((len(world), 2, self.count))
-        width = len(self.free)
-        for i, camera in enumerate(self.cameras):
-            rows = self.views.rows(i)
-            full[rows, :, i * width : (i + 1) * width] = camera.parameter_jacobian(
-                world[rows], self.free
-            )
-            by_point = camera.project_jacobian(world[rows])
-            for j, pose in enumerate(self.poses[1:], start=1):
-                chosen = self.views.placement[rows] == j
-                arms = world[rows[chosen]] - pose.translation_mm
-                turned = np.cross(arms[:, None, :], by_point[chosen])  # row . -[a]x = a x row
-                start = width * len(self.cameras) + 6 * (j - 1)
-                full[rows[chosen], :, start : start + 3] = turned
-                full[rows[chosen], :, start + 3 : start + 6] = by_point[chosen]
-        return full.reshape(-1, self.count)
-
-
-def _adjust(views: _Views, cameras: list[Camera], poses: list[RigidTransform], model: str) -> Rig:
-    free = model_named(model).free
-    start = _Bundle(views, cameras, poses, free)
-
-    def function(x: FloatArray) -> tuple[FloatArray, FloatArray]:
-        state = start.at(x)
-        return state.residuals().ravel(), -state.jacobian() @ _turns_as_added(x, start)
-
-    fit = levenberg_marquardt(function, np.zeros(start.count), step_limit=1e-9)
-    state = start.at(fit.x)
-    dof = 2 * len(views.points) - start.count
-    variance = fit.cost / max(dof, 1)
-    jacobian = state.jacobian()
-    scale = np.maximum(np.linalg.norm(jacobian, axis=0), 1e-300)
-    _, singular, vt = np.linalg.svd(jacobian / scale, full_matrices=False)
-    if singular[-1] < 1e-10 * singular[0]:
-        raise GeometryError(
-            "the placements do not determine the cameras: their poses are too alike",
-            remedy="tilt the target by 20 to 40 degrees about different axes",
-        )
-    full_cov = variance * (vt.T / singular**2) @ vt / np.outer(scale, scale)
-    count = len(free) * len(cameras)
-    world = state.world_mm()
-    volume = np.stack([world.min(axis=0), world.max(axis=0)])
-    names = tuple(f"{camera.name}.{name}" for camera in state.cameras for name in free)
+    chosen, volume = model_named(name), checked_volume(volume_mm)
+    placed = place(join(points, control, size_px))
+    solution = solve_bundle(placed, chosen)
+    cameras, covariance = solution.fit.bundle.cameras, solution.covariance()
+    world = placed.in_world(solution.fit.bundle)
+    outliers = np.flatnonzero(world.usable & ~solution.kept).astype(np.int64)
+    report = _report(world, solution, chosen, covariance)
+    report["outliers"] = describe_outliers(
+        world, cameras, outliers, solution.xy_px, known_poses=False
+    )
+    report["volume"] = "stated" if volume_mm is not None else "bounding box of all placements"
+    warn_of(report)
     return Rig(
-        cameras=tuple(state.cameras),
-        volume_mm=volume,
-        parameters=names,
-        parameter_cov=0.5 * (full_cov + full_cov.T)[:count, :count],
-        noise_px=float(np.sqrt(variance)),
-        dof=dof,
-        model=model,
-        residuals=Residuals(
-            camera=views.points.camera,
-            placement=views.points.placement,
-            point=views.points.point,
-            xyz_mm=world,
-            xy_px=views.points.xy_px,
-            residual_px=state.residuals(),
-            fitted=np.ones(len(world), dtype=bool),
-            flags=np.zeros(len(world), dtype=np.int64),
-        ),
-        report=_report(state, full_cov, fit.converged, model),
+        cameras=cameras,
+        volume_mm=bounding_box(world, outliers) if volume is None else volume,
+        parameters=tuple(f"{camera.name}.{name}" for camera in cameras for name in chosen.free),
+        parameter_cov=covariance,
+        noise_px=solution.noise_px,
+        tau_px=unstated_px(world, cameras, solution.kept, solution.xy_px, solution.fit.dof),
+        dof=solution.fit.dof,
+        model=name,
+        residuals=residual_table(world, cameras, solution.kept, solution.xy_px),
+        report=report,
     )
 
 
-def _turns_as_added(x: FloatArray, bundle: _Bundle) -> FloatArray:
-    """Return d (small turn at x) / d x: the identity but for the rotation vectors at x."""
-    change = np.eye(len(x))
-    width = len(bundle.free)
-    starts = [i * width + bundle.free.index("rx") for i in range(len(bundle.cameras))]
-    starts += list(range(width * len(bundle.cameras), len(x), 6))
-    for start in starts:
-        change[start : start + 3, start : start + 3] = left_jacobian(x[start : start + 3])
-    return change
-
-
-def _report(state: _Bundle, cov: FloatArray, converged: bool, model: str) -> dict[str, Any]:
-    cameras: dict[str, Any] = {}
-    std = np.sqrt(np.diag(cov))
-    width = len(state.free)
-    residual = state.residuals()
-    for i, camera in enumerate(state.cameras):
-        own = residual[state.views.rows(i)]
-        cameras[camera.name] = {
-            "parameters": {
-                name: {
-                    "value": camera.parameter(name),
-                    "std": float(std[i * width + j]),
-                    "free": True,
-                }
-                for j, name in enumerate(state.free)
-                if name not in POSE
-            },
-            "rss_px2": float(np.sum(own**2)),
-            "n": 2 * len(own),
-            "converged": bool(converged),
-        }
+def _report(
+    world: Observations, solution: BundleSolution, model: Model, covariance: FloatArray
+) -> dict[str, Any]:
+    """Say what `fit_report` says, and what concerns the placements."""
+    fit, xy = solution.fit, solution.xy_px
     return {
-        "cameras": cameras,
-        "fixed": model_named(model).fixed,
+        "method": METHOD,
+        "model": model.name,
+        "noise_px": solution.noise_px,
+        "dof": fit.dof,
+        "weights": describe_weights(
+            world,
+            tau_px=solution.tau_px,
+            chi_square_per_dof=fit.chi_square / fit.dof if solution.weighted else None,
+            linear=False,
+        ),
+        "left_out": left_out(world),
+        "cameras": _cameras_report(solution, model, covariance),
+        "disc_bias": bias_report(world, xy),
+        "discordant": discordant(world, solution.kept, xy, noise_px=solution.noise_px, dof=fit.dof),
         "free_poses": {
-            "world": f"target's frame in placement {state.views.placements[0]!r}",
-            "placements": len(state.poses),
+            "world": f"target's frame in placement {solution.placed.placements[0]!r}",
+            "placements": len(fit.bundle.poses),
         },
     }
+
+
+def _cameras_report(
+    solution: BundleSolution, model: Model, covariance: FloatArray
+) -> dict[str, Any]:
+    fit, camera_of = solution.fit, solution.seen.camera
+    std = np.sqrt(np.diag(covariance)).reshape(-1, len(model.free))
+    # the placements' parameters belong to no camera: each point's own share of the freedom counts
+    freedom = 2 - np.sum(fit.orthonormal**2, axis=(1, 2))
+    cameras: dict[str, Any] = {}
+    for i, camera in enumerate(fit.bundle.cameras):
+        own = camera_of[solution.used] == i
+        rss = float(np.sum(fit.residual_px[own] ** 2))
+        cameras[camera.name] = {
+            "points": int(np.count_nonzero(own)),
+            "outliers": int(np.count_nonzero((camera_of == i) & ~solution.used)),
+            "n": 2 * int(np.count_nonzero(own)),
+            "p": len(model.free),
+            "rss_px2": rss,
+            "s_px": float(np.sqrt(rss / max(float(freedom[own].sum()), 1.0))),
+            "condition": fit.condition,
+            "iterations": fit.iterations,
+            "converged": fit.converged,
+            "parameters": describe_parameters(camera, model, std[i]),
+        }
+    return cameras

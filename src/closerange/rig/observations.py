@@ -73,6 +73,18 @@ class Observations:
         """Camera names."""
         return tuple(self.size_px)
 
+    def select(self, rows: BoolArray) -> Observations:
+        """Keep some rows; no camera is dropped."""
+        return Observations(
+            points=self.points.select(rows),
+            size_px=self.size_px,
+            camera=self.camera[rows],
+            control_row=self.control_row[rows],
+            xyz_mm=self.xyz_mm[rows],
+            std_mm=self.std_mm[rows],
+            usable=self.usable[rows],
+        )
+
     def rows(self, camera: int) -> IntArray:
         """Return the usable rows of a camera."""
         return np.flatnonzero(self.usable & (self.camera == camera)).astype(np.int64)

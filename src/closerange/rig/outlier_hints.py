@@ -22,6 +22,8 @@ def describe_outliers(
     cameras: Sequence[Camera],
     rows: IntArray,
     xy_px: FloatArray,
+    *,
+    known_poses: bool = True,
 ) -> list[dict[str, Any]]:
     """List outliers with a guess at their cause.
 
@@ -35,6 +37,9 @@ def describe_outliers(
         The outliers.
     xy_px : ndarray, shape (N, 2)
         Image positions that were compared.
+    known_poses : bool, optional
+        The positions are those of the control table; False where placements were estimated, so
+        that no row of it can be blamed.
 
     Returns
     -------
@@ -45,7 +50,7 @@ def describe_outliers(
     """
     points = observations.points
     entries: list[dict[str, Any]] = []
-    errors = _control_errors(observations, cameras, rows, xy_px)
+    errors = _control_errors(observations, cameras, rows, xy_px) if known_poses else {}
     for row in rows:
         camera = cameras[observations.camera[row]]
         seen, known = xy_px[row], observations.xyz_mm[row]
@@ -58,7 +63,7 @@ def describe_outliers(
             "hint": "",
         }
         error = errors.get(int(observations.control_row[row]))
-        sign = _lost_sign(camera, known, seen)
+        sign = _lost_sign(camera, known, seen) if known_poses else ""
         if error is not None:
             entry["control_error_mm"] = [float(value) for value in error]
             entry["hint"] = (

@@ -2,8 +2,9 @@
 
 A point is tested with the residual it has when it takes no part in the fit, against the noise of
 the other points (Baarda's data snooping, 1968, with the variance estimated).
-Many blunders at once inflate that noise and hide each other; then a robust fit sorts the points
-first.
+Many blunders at once inflate that noise and hide each other, and a far one bends the lens until
+no residual is left. A fit that hints at blunders is therefore not asked which they are: it is done
+again from the points that most others agree with, and takes back those that these foretell.
 """
 
 from __future__ import annotations
@@ -17,7 +18,7 @@ import numpy as np
 from closerange.errors import GeometryError
 from closerange.geometry.arrays import BoolArray, FloatArray
 from closerange.rig.camera import Camera
-from closerange.rig.camera_fit import CameraFit, fit_camera, strong_parameters
+from closerange.rig.camera_fit import CameraFit, fit_camera
 from closerange.rig.fit import Fit
 from closerange.rig.view import View, whiten
 
@@ -47,8 +48,10 @@ SUBSET, SUBSETS = 8, 256
 """Points of a subset (six would do, and be worse) and how many are drawn: with one point in ten
 wrong, one subset in two is clean; with four in ten, one in sixty."""
 
-FORETOLD = 10.0
-"""Standard deviations of the noise to which a point must be predicted to be taken back."""
+FORETOLD = 100.0
+"""Standard deviations of the noise to which a point must be predicted to be taken back. A corner of
+the block whose neighbours are out is foretold to ten or twenty; what is not to a hundred lies so
+far away that the lens could be bent to any residual, even that of a lost decimal point."""
 
 FAR = 10.0
 """Times the median miss of the best subset beyond which a point has no part in the start: lens
@@ -69,7 +72,7 @@ class CleanFit:
     kept : ndarray of bool, shape (N,)
         Points that took part.
     plain_px : float
-        Noise of the fit of all points.
+        Noise of the fit of all points; infinite if there is none.
     """
 
     fit: CameraFit
@@ -104,22 +107,24 @@ def fit_without_blunders(
         If the points cannot be fitted, with or without blunders.
     """
     everything = np.ones(len(view), dtype=bool)
-    plain, refusal = None, None
+    plain: CameraFit | None = None
+    refusal: GeometryError | None = None
     try:
         plain = fitter(view, None)
         if not _suspect(plain, trials):
             return CleanFit(plain, everything, _plain_px(plain))
     except GeometryError as error:
         refusal = error
+    plain_px = np.inf if plain is None else _plain_px(plain)
     try:
         fit, kept = _exchange(view, fitter, _sorted_robustly(view, robust_free), trials)
-    except GeometryError:  # too little is left to carry the parameters
-        kept = np.zeros(len(view), dtype=bool)
-    if np.count_nonzero(~kept) <= MAX_SHARE * len(view):
-        return CleanFit(fit, kept, np.inf if plain is None else _plain_px(plain))
+        if np.count_nonzero(~kept) <= MAX_SHARE * len(view):
+            return CleanFit(fit, kept, plain_px)
+    except GeometryError as error:  # too little is left to carry the parameters
+        refusal = refusal or error
     if plain is None:
         raise refusal or GeometryError(f"camera {view.name!r}: no fit was found")
-    return CleanFit(plain, everything, _plain_px(plain))
+    return CleanFit(plain, everything, plain_px)
 
 
 def _suspect(fit: CameraFit, trials: int) -> bool:
@@ -179,7 +184,7 @@ def _subset_misses(world: FloatArray, image: FloatArray) -> FloatArray:
     matrices *= np.sign(np.linalg.det(matrices[:, :, :3]))[:, None, None]
     seen = matrices @ world.T
     with np.errstate(divide="ignore", invalid="ignore"):
-        square = np.sum((seen[:, :2] / seen[:, 2:] - image.T) ** 2, axis=1)
+        square: FloatArray = np.sum((seen[:, :2] / seen[:, 2:] - image.T) ** 2, axis=1)
     square[~(seen[:, 2] > 0)] = np.inf
     square[~np.isfinite(np.take_along_axis(square, draws, axis=1)).all(axis=1)] = np.inf
     return square
@@ -304,33 +309,29 @@ def _exchange(
 
 
 def _sorted_robustly(view: View, free: tuple[str, ...]) -> BoolArray:
-    """Keep the points that a robust fit explains."""
+    """Keep the points that a robust fit explains, from a start that blunders have no part in."""
     start = fit_camera(view.select(consensus(view)), free).camera
     square = _robust_squares(view, free, start)
-    variance = max(inner_variance(square, view.xy_px.size - len(free)), ROUNDING_PX**2)
+    variance = max(_inner_variance(square, view.xy_px.size - len(free)), ROUNDING_PX**2)
     return np.asarray(square <= ROBUST_LIMIT * variance)
 
 
 def _robust_squares(view: View, free: tuple[str, ...], start: Camera) -> FloatArray:
-    """Squared whitened residuals of a fit by reweighting: Cauchy's weights, then Geman-McClure's.
+    """Squared whitened residuals of a fit by reweighting, which forgets blunders.
 
-    Cauchy's pull every point a little, so that the search does not stick; the others forget a
-    blunder altogether. Parameters that could follow a blunder are freed last.
+    The weights are those of Geman and McClure; a point behind the camera has none.
     """
-    camera, square = start, _squares(view, start)
-    for stage, power in ((free, 2),):
-        last = 0.0
-        for _ in range(REWEIGHTINGS):
-            variance = max(inner_variance(square, view.xy_px.size - len(stage)), ROUNDING_PX**2)
-            if not np.isfinite(variance) or abs(variance - last) <= SETTLED * last:
-                break
-            last = variance
-            # four variances: a Gaussian residual keeps most of its weight
-            weight = 1 / (1 + square / (4 * variance)) ** power
-            seen = np.isfinite(square)  # there is no way down for a point behind the camera
-            points = _reweighted(view, weight).select(seen)
-            camera = fit_camera(points, stage, camera, max_iterations=STEPS_PER_REWEIGHTING).camera
-            square = _squares(view, camera)
+    camera, square, last = start, _squares(view, start), 0.0
+    for _ in range(REWEIGHTINGS):
+        variance = max(_inner_variance(square, view.xy_px.size - len(free)), ROUNDING_PX**2)
+        if not np.isfinite(variance) or abs(variance - last) <= SETTLED * last:
+            break
+        last = variance
+        # four variances: a Gaussian residual keeps most of its weight
+        weight = 1 / (1 + square / (4 * variance)) ** 2
+        points = _reweighted(view, weight).select(np.isfinite(square))
+        camera = fit_camera(points, free, camera, max_iterations=STEPS_PER_REWEIGHTING).camera
+        square = _squares(view, camera)
     return square
 
 
@@ -356,10 +357,10 @@ def _plain_px(fit: CameraFit) -> float:
 
 
 def _inner_noise(whitened: FloatArray, dof: int) -> float:
-    return float(np.sqrt(inner_variance(np.sum(whitened**2, axis=1), dof)))
+    return float(np.sqrt(_inner_variance(np.sum(whitened**2, axis=1), dof)))
 
 
-def inner_variance(square: FloatArray, dof: int) -> float:
+def _inner_variance(square: FloatArray, dof: int) -> float:
     """Variance of one coordinate by the median: squares of two Gaussians are exponential."""
     return float(np.median(square) / (2 * np.log(2)) * 2 * len(square) / max(dof, 1))
 

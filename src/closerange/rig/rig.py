@@ -125,6 +125,11 @@ class Rig:
         What was fixed and why, model choice, rejected points: JSON-ready.
     provenance : mapping
         Program version, options and hashes of inputs: JSON-ready.
+    tau_px : float
+        What the covariances of the calibration's image points left out (print, lens, sensor), as
+        the standard deviation of one image coordinate: points that state a covariance C are
+        measured with C + tau^2 I. 0 where it did not show, or no point stated a covariance. Errors
+        of control positions whose ``std_mm`` is not stated are a part of it.
     """
 
     cameras: tuple[Camera, ...]
@@ -138,6 +143,7 @@ class Rig:
     trust: Trust | None = None
     report: Mapping[str, Any] = field(default_factory=dict)
     provenance: Mapping[str, Any] = field(default_factory=dict)
+    tau_px: float = 0.0
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "cameras", tuple(self.cameras))
@@ -147,6 +153,8 @@ class Rig:
         object.__setattr__(self, "volume_mm", frozen_array(self.volume_mm, (2, 3), "volume_mm"))
         if not (self.volume_mm[0] <= self.volume_mm[1]).all():
             raise ValueError("volume_mm: the lower corner must not exceed the upper one")
+        if not 0 <= self.tau_px < np.inf:
+            raise ValueError(f"tau_px is {self.tau_px}; a standard deviation is at least 0")
         count = len(self.parameters)
         object.__setattr__(self, "parameters", tuple(self.parameters))
         object.__setattr__(
@@ -186,8 +194,15 @@ class Rig:
 
     @property
     def trusted(self) -> bool:
-        """False if the rig was judged untrustworthy and accepted all the same."""
-        return self.trust is None or self.trust.verdict != "untrustworthy"
+        """False if the rig was judged untrustworthy, or its own uncertainty is not known."""
+        return self.uncertainty_known and (
+            self.trust is None or self.trust.verdict != "untrustworthy"
+        )
+
+    @property
+    def uncertainty_known(self) -> bool:
+        """Whether noise and covariance are such that positions get covariances."""
+        return 0 < self.noise_px < np.inf and bool(np.isfinite(self.parameter_cov).all())
 
 
 def _micrometres(value_mm: float) -> str:

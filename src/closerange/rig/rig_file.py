@@ -1,7 +1,8 @@
 """The rig file: JSON of our own schema, readable by a person, strict, and exact both ways.
 
 Rows of numbers stand on one line. Geometry (matrices, poses, lenses, volume) must be finite;
-estimates of uncertainty may be ``null``, which means NaN: not known. Keys that the schema does
+estimates of uncertainty may be ``null``, which means NaN: not known; noise and covariance only
+of a rig that is marked untrustworthy, since nothing else could mark what it measures. Keys that the schema does
 not have are refused, since one that is not understood may change what the others mean; free
 notes have their place under ``report`` and ``provenance``.
 """
@@ -84,7 +85,8 @@ def read_rig(path: Path | str) -> Rig:
     FileError
         If the file is missing, unreadable, larger than 64 MiB or not text (a pickle, an archive).
     SchemaError
-        If it is not JSON of the schema ``closerange.rig/1``; names file, key and remedy.
+        If it is not JSON of the schema ``closerange.rig/2`` or ``closerange.rig/1``, or a rig that
+        is not marked untrustworthy lacks noise or covariance; names file, key and remedy.
     """
     return rig_from_document(load_json(path, max_bytes=MAX_RIG_BYTES), source=str(path))
 
@@ -113,6 +115,7 @@ def rig_to_document(rig: Rig) -> dict[str, Any]:
         "model": rig.model,
         "trust": None if rig.trust is None else _trust_document(rig.trust),
         "noise_px": _number(rig.noise_px),
+        "tau_px": _number(rig.tau_px),
         "dof": int(rig.dof),
         "volume_mm": _numbers(rig.volume_mm),
         "cameras": [_camera_document(camera) for camera in rig.cameras],
@@ -142,7 +145,8 @@ def rig_from_document(document: Any, *, source: str = "rig") -> Rig:
     Raises
     ------
     SchemaError
-        If it is not of the schema ``closerange.rig/1``; names file, key and remedy.
+        If it is not of the schema ``closerange.rig/2`` or ``closerange.rig/1``; names file, key
+        and remedy.
     """
     return rig_from_reader(Reader(document, source))
 

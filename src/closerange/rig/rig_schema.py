@@ -23,7 +23,10 @@ from closerange.rig.distortion import (
 )
 from closerange.rig.rig import Residuals, Rig, Trust
 
-SCHEMA = "closerange.rig/1"
+SCHEMA = "closerange.rig/2"
+
+SCHEMAS = (SCHEMA, "closerange.rig/1")
+"""What is read. Version 1 knew no ``tau_px``: its positions state what detection states alone."""
 
 INFINITE = "infinite"
 """Stands for an error without bound in ``trust``; JSON has no such number."""
@@ -166,6 +169,7 @@ def rig_from_reader(root: Reader) -> Rig:
         (
             *("schema", "model", "trust", "noise_px", "dof", "volume_mm", "cameras"),
             *("parameters", "parameter_cov", "report", "provenance", "residuals"),
+            *(("tau_px",) if root.value["schema"] == SCHEMA else ()),
         )
     )
     cameras = tuple(_camera(item) for item in fields["cameras"].items())
@@ -176,14 +180,15 @@ def rig_from_reader(root: Reader) -> Rig:
             "give each camera a name of its own",
         )
     parameters = _parameters(fields["parameters"], names)
-    trust = fields["trust"]
-    return root.build(
+    trust, tau = fields["trust"], fields.get("tau_px")
+    rig = root.build(
         lambda: Rig(
             cameras=cameras,
             volume_mm=fields["volume_mm"].array((2, 3)),
             parameters=parameters,
             parameter_cov=_covariance(fields["parameter_cov"], len(parameters)),
-            noise_px=_not_negative(fields["noise_px"]),
+            noise_px=_noise(fields["noise_px"]),
+            tau_px=0.0 if tau is None else _not_negative(tau, null=False),
             dof=fields["dof"].integer(0, 2**53),
             model=fields["model"].text(),
             residuals=_residuals(fields["residuals"], names),
@@ -193,16 +198,29 @@ def rig_from_reader(root: Reader) -> Rig:
         ),
         "correct the value",
     )
+    _require_uncertainty(rig, fields)
+    return rig
+
+
+def _require_uncertainty(rig: Rig, fields: dict[str, Reader]) -> None:
+    """Refuse an unknown uncertainty, unless the verdict marks all that is measured with it."""
+    if rig.uncertainty_known or (rig.trust is not None and rig.trust.verdict == "untrustworthy"):
+        return
+    key = "noise_px" if math.isnan(rig.noise_px) else "parameter_cov"
+    fields[key].fail(
+        "null: positions would have no covariance, and nothing would say so",
+        "calibrate again; only a rig with the verdict 'untrustworthy' may lack it",
+    )
 
 
 def _check_schema(root: Reader) -> None:
     """Refuse other files and other versions before looking at their keys."""
     found = root.value.get("schema") if isinstance(root.value, dict) else None
-    if found == SCHEMA:
+    if found in SCHEMAS:
         return
     if isinstance(found, str) and found.startswith(SCHEMA.partition("/")[0] + "/"):
         root.fail(
-            f"schema {_shown(found)}, this program reads {SCHEMA!r}",
+            f"schema {_shown(found)}, this program reads {' and '.join(map(repr, SCHEMAS))}",
             "use the version of closerange that wrote it, or calibrate again",
         )
     root.fail(
@@ -286,10 +304,19 @@ def _covariance(reader: Reader, count: int) -> FloatArray:
     return covariance
 
 
-def _not_negative(reader: Reader) -> float:
-    value = reader.number(null=True)
+def _not_negative(reader: Reader, *, null: bool = True) -> float:
+    value = reader.number(null=null)
     if value < 0:
         reader.fail(f"{value} is negative", "correct the value")
+    return value
+
+
+def _noise(reader: Reader) -> float:
+    value = _not_negative(reader)
+    if value == 0:
+        reader.fail(
+            "0 px: no image is free of noise, and nothing could be weighed", "calibrate again"
+        )
     return value
 
 

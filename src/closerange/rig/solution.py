@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -164,6 +164,8 @@ def solve(
             _fit_one(i, view, model, cameras[i], kept=kept[i], trials=len(observations))
             for i, view in enumerate(views)
         ]
+        if any(rows is None for rows in kept):
+            clean = _without_wrong_rows(views, model, stated, clean)
         cameras = [result.fit.camera for result in clean]
         last, tau2 = tau2, _common_variance(clean, views, stated)
         if not weighted or (last >= 0 and abs(tau2 - last) <= SETTLED * last):
@@ -180,6 +182,34 @@ def solve(
         tau_px=float(np.sqrt(tau2)),
         weighted=weighted,
     )
+
+
+def _without_wrong_rows(
+    views: Sequence[View], model: Model, stated: Sequence[Stated], clean: list[CleanFit]
+) -> list[CleanFit]:
+    """Leave out in all cameras the control rows that two of them contradict.
+
+    Two cameras do not both misplace one point by chance: its position is wrong. Another camera
+    that lies in the direction of the error sees little of it, and would keep the point.
+    """
+    contradicted = [
+        np.setdiff1d(part.control_row, part.control_row[result.kept])
+        for part, result in zip(stated, clean, strict=True)
+    ]
+    rows, votes = np.unique(np.concatenate(contradicted), return_counts=True)
+    wrong = rows[votes > 1]
+    found: list[CleanFit] = []
+    for index, (view, part, result) in enumerate(zip(views, stated, clean, strict=True)):
+        kept = result.kept & ~np.isin(part.control_row, wrong)
+        if (kept == result.kept).all():
+            found.append(result)
+            continue
+        try:
+            again = _fit_one(index, view, model, result.fit.camera, kept=kept, trials=len(view))
+        except CameraRefusedError:  # too few points to do without them
+            again = result
+        found.append(replace(again, plain_px=result.plain_px))
+    return found
 
 
 def _stated(observations: Observations, camera: int, model: Model) -> Stated:

@@ -7,7 +7,6 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 
-import numpy as np
 from numpy.typing import ArrayLike
 
 from closerange.errors import CloseRangeWarning, UntrustedError
@@ -15,6 +14,7 @@ from closerange.features.control import ControlPoints, read_control
 from closerange.features.image_points import ImagePoints
 from closerange.features.points_table import read_points
 from closerange.rig.calibrate import calibrate_rig
+from closerange.rig.findings import checked_volume
 from closerange.rig.free_poses import calibrate_free_poses
 from closerange.rig.rig import Rig
 from closerange.verification.travel import travel_hints
@@ -86,16 +86,20 @@ def calibrate(
         control = read_control(control)
     inputs = input_hashes(_files(*named))  # after the readers, which refuse devices and pipes
     sizes = {**points.size_px, **(image_size or {})}
-    volume = None if volume_mm is None else np.reshape(np.asarray(volume_mm, np.float64), (2, 3))
+    volume = checked_volume(volume_mm)
     if free_poses:
-        rig = calibrate_free_poses(points, control, sizes, model=model)
+        rig = calibrate_free_poses(points, control, sizes, model=model, volume_mm=volume)
     else:
         rig = calibrate_rig(
             points, control, sizes, model=model, volume_mm=volume, progress=progress
         )
         rig = _with_travel_hints(rig)
     trust = judge_rig(rig, volume_given=volume is not None)
-    options = {"model": model, "volume_mm": None if volume is None else volume.tolist()}
+    options = {
+        "model": model,
+        "volume_mm": None if volume is None else volume.tolist(),
+        "free_poses": free_poses,
+    }
     provenance = {**versions(), "options": options, "inputs": inputs}
     rig = replace(rig, trust=trust, provenance={**rig.provenance, **provenance})
     if not rig.trusted and not accept_untrusted:

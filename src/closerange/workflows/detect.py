@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -83,29 +84,19 @@ def detect(
     """
     if not isinstance(target, Target):
         target = read_target(target)
-    sources = _sources(images)
-    if placement is not None and len(sources) > 1:
-        raise InputError(
-            f"one placement name for {len(sources)} images",
-            remedy="use --placement-pattern, or name one image",
-        )
-    offsets = _offsets(crops)
-    found: ImagePoints | None = None
+    sources = _sources(images, placement)
+    names = _Names(placement, placement_pattern)
+    offsets = read_crops(crops) if isinstance(crops, (str, Path)) else crops
     _warn_if_symmetric(target)
-    frames = (
-        source if isinstance(source, Frame) else read_image(source, camera=camera)
-        for source in sources
-    )
-    for done, frame in enumerate(distinct(frames), start=1):
-        name, reading = _names(frame, placement, placement_pattern)
-        points = _detect_one(frame, target, name, reading, estimator)
+    found: ImagePoints | None = None
+    for done, frame in enumerate(distinct(_frames(sources, camera)), start=1):
+        points = _detect_one(frame, target, names, estimator)
         if offsets is not None:
             points = points.shifted(_offset_of(frame, offsets))
         found = points if found is None else _joined(found, points, frame)
         if progress:
             progress(done, len(sources))
-    if found is None:
-        raise InputError("no image was named", remedy="name at least one image or folder")
+    assert found is not None  # noqa: S101  # there is at least one source
     return found
 
 
@@ -132,14 +123,42 @@ def read_crops(path: Path | str) -> dict[str, tuple[float, float]]:
     return dict(zip(table.texts("image"), corners, strict=True))
 
 
-def _sources(images: Images) -> list[Path | Frame]:
+@dataclass(frozen=True, slots=True)
+class _Names:
+    """How an image's placement and reading are named."""
+
+    placement: str | None
+    pattern: str | None
+
+    def of(self, frame: Frame) -> tuple[str, str]:
+        """Return placement and reading."""
+        if self.placement is not None:
+            return self.placement, ""
+        return placement_and_reading(Path(frame.source), self.pattern)
+
+
+def _sources(images: Images, placement: str | None) -> list[Path | Frame]:
+    """List the images; folders give theirs."""
     listed: Iterable[str | Path | Frame] = (
         [images] if isinstance(images, (str, Path, Frame)) else images
     )
     sources: list[Path | Frame] = []
     for image in listed:
         sources.extend([image] if isinstance(image, Frame) else list_images(Path(image)))
+    if not sources:
+        raise InputError("no image was named", remedy="name at least one image or folder")
+    if placement is not None and len(sources) > 1:
+        raise InputError(
+            f"one placement name for {len(sources)} images",
+            remedy="use --placement-pattern, or name one image",
+        )
     return sources
+
+
+def _frames(sources: Iterable[Path | Frame], camera: str) -> Iterator[Frame]:
+    """Read images one by one, so that few are in memory at a time."""
+    for source in sources:
+        yield source if isinstance(source, Frame) else read_image(source, camera=camera)
 
 
 def _warn_if_symmetric(target: Target) -> None:
@@ -154,15 +173,8 @@ def _warn_if_symmetric(target: Target) -> None:
         )
 
 
-def _names(frame: Frame, placement: str | None, pattern: str | None) -> tuple[str, str]:
-    if placement is not None:
-        return placement, ""
-    return placement_and_reading(Path(frame.source), pattern)
-
-
-def _detect_one(
-    frame: Frame, target: Target, placement: str, reading: str, estimator: str
-) -> ImagePoints:
+def _detect_one(frame: Frame, target: Target, names: _Names, estimator: str) -> ImagePoints:
+    placement, reading = names.of(frame)
     try:
         check_frame(frame)
         return detect_target(
@@ -179,12 +191,6 @@ def _joined(found: ImagePoints, points: ImagePoints, frame: Frame) -> ImagePoint
         return found + points
     except CloseRangeError as error:
         raise InputError(f"{frame.source}: {error.message}", remedy=error.remedy) from error
-
-
-def _offsets(
-    crops: Mapping[str, tuple[float, float]] | Path | str | None,
-) -> Mapping[str, tuple[float, float]] | None:
-    return read_crops(crops) if isinstance(crops, (str, Path)) else crops
 
 
 def _offset_of(frame: Frame, offsets: Mapping[str, tuple[float, float]]) -> np.ndarray:

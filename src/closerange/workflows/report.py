@@ -12,7 +12,7 @@ from closerange.errors import SchemaError
 from closerange.files import MAX_TABLE_BYTES, load_json
 from closerange.rig.rig import Rig
 from closerange.rig.rig_file import rig_from_document
-from closerange.rig.rig_schema import SCHEMA as RIG_SCHEMA
+from closerange.rig.rig_schema import SCHEMAS as RIG_SCHEMAS
 from closerange.verification.error_map import ErrorMap, judged_volume, predict_errors
 from closerange.verification.result_file import SCHEMA as RESULT_SCHEMA
 from closerange.verification.result_file import read_result
@@ -50,7 +50,7 @@ def report(source: Path | str) -> str:
     """
     document = load_json(source, max_bytes=MAX_TABLE_BYTES)
     schema = document.get("schema") if isinstance(document, dict) else None
-    if schema == RIG_SCHEMA:
+    if schema in RIG_SCHEMAS:
         return report_of_rig(rig_from_document(document, source=str(source)))
     if schema == RESULT_SCHEMA:
         return report_of_result(read_result(source))

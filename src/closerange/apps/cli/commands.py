@@ -80,7 +80,7 @@ def detect(
     ] = None,
     _json: options.Json = False,
 ) -> Outcome:
-    """Find a target in the images of one camera; several images are several placements."""
+    """Find a target in the images of one camera. Several images are several placements."""
     from closerange.apps.cli.screens import points_summary, points_text
     from closerange.features.points_table import write_points
     from closerange.workflows.detect import detect as work

@@ -27,6 +27,10 @@ DEFECT = 70
 """Exit code of a mistake in the program itself (EX_SOFTWARE of sysexits.h): neither the command
 nor the data are to blame."""
 
+TOO_LARGE = CloseRangeError(
+    "the memory does not suffice", remedy="use smaller or fewer images at a time"
+)
+
 _shown: list[str] = []  # warnings of the command that runs, for its JSON summary
 _kept: list[str] = []  # files that it has written, in case it is interrupted
 
@@ -84,10 +88,7 @@ def verb(command: Callable[P, Outcome]) -> Callable[P, None]:
         except KeyboardInterrupt:
             code = _tell_interruption(as_json=as_json)
         except MemoryError:
-            error = CloseRangeError(
-                "the memory does not suffice", remedy="use smaller or fewer images at a time"
-            )
-            code = tell_error(error, as_json=as_json)
+            code = tell_error(TOO_LARGE, as_json=as_json)
         except Exception as defect:  # noqa: BLE001  # whatever it is: words, not a traceback
             code = _tell_defect(defect, as_json=as_json)
         raise typer.Exit(code)

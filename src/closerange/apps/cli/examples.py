@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-_EXAMPLES = {
+EXAMPLES = {
     "detect": (
         "closerange detect closerange-demo/inputs/calibration/left_*.png",
         "--target closerange-demo/inputs/plate.toml --camera left",
@@ -54,7 +54,7 @@ def epilog(verb: str) -> str:
         Text whose first character, ``\b``, keeps the help from breaking its lines anew.
     """
     after = "" if verb == "demo" else " (after closerange demo)"
-    return f"\b\nExample{after}:\n  " + " \\\n    ".join(_EXAMPLES[verb])
+    return f"\b\nExample{after}:\n  " + " \\\n    ".join(EXAMPLES[verb])
 
 
 def line(verb: str) -> str:
@@ -70,4 +70,4 @@ def line(verb: str) -> str:
     str
         The command.
     """
-    return " ".join(_EXAMPLES[verb])
+    return " ".join(EXAMPLES[verb])

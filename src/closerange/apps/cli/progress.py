@@ -58,9 +58,10 @@ class Progress:
 
     def _show(self, what: str) -> None:
         done, total = self._steps[what]
-        if what not in self._tasks:
-            self._tasks[what] = self._bar.add_task(what, total=total)
-        self._bar.update(self._tasks[what], completed=done, total=total)
+        if what in self._tasks:
+            self._bar.update(self._tasks[what], completed=done, total=total)
+        else:
+            self._tasks[what] = self._bar.add_task(what, completed=done, total=total)
 
     def _open(self) -> None:
         from rich.console import Console

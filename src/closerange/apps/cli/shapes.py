@@ -107,7 +107,7 @@ def find(
     ] = None,
     _json: options.Json = False,
 ) -> Outcome:
-    """Find taught shapes in the images of one camera; several images are several placements."""
+    """Find taught shapes in the images of one camera. Several images are several placements."""
     from closerange.apps.cli.screens import points_summary, points_text
     from closerange.features.points_table import write_points
     from closerange.workflows.shapes import find_shapes as work

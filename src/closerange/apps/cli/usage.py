@@ -4,16 +4,17 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Sequence
-from typing import Any
+from difflib import get_close_matches
+from typing import Any, cast
 
 import typer
 from typer.core import TyperGroup
 
 from closerange.apps.cli.console import INTERRUPTED, tell_error
-from closerange.apps.cli.examples import line
+from closerange.apps.cli.examples import EXAMPLES, line
 from closerange.errors import InputError
 
-UsageError = typer.BadParameter.__bases__[0]
+UsageError = cast(type[Exception], typer.BadParameter.__bases__[0])
 """What the parser raises. Newer versions of typer bring a click of their own: only its child has
 a public name in all of them."""
 
@@ -29,19 +30,21 @@ class Verbs(TyperGroup):
         try:
             code = super().main(given, *more, **extra)
         except UsageError as error:
-            told = InputError(_message(error, given), remedy=self._remedy(error, given))
+            told = InputError(_message(error, given), remedy=_remedy(given))
             code = tell_error(told, as_json="--json" in options)
         except (KeyboardInterrupt, typer.Abort):  # before the verb began to work
             code = INTERRUPTED
         sys.exit(code if isinstance(code, int) else 0)
 
-    def _remedy(self, error: Any, given: list[str]) -> str:
-        """Show the example of the verb that was meant, and point to its help."""
-        verb = given[0] if given else ""
-        if verb in self.commands:
-            return f"for instance {line(verb)}\ncloserange {verb} --help explains every option"
-        _, meant, near = error.format_message().partition("Did you mean ")
-        return f"{meant.lower()}{near}{' ' * bool(near)}closerange --help lists the verbs"
+
+def _remedy(given: list[str]) -> str:
+    """Show the example of the verb that was meant, and point to its help."""
+    verb = next((name for name in (" ".join(given[:2]), *given[:1]) if name in EXAMPLES), "")
+    if verb:
+        return f"for instance {line(verb)}\ncloserange {verb} --help explains every option"
+    near = get_close_matches(given[0], EXAMPLES, n=1) if given else []
+    question = f"did you mean {near[0]!r}? " if near else ""
+    return f"{question}closerange --help lists the verbs"
 
 
 def _message(error: Any, given: list[str]) -> str:

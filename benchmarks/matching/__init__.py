@@ -1,0 +1,1 @@
+"""Matching measured beside rivals: scenes with exact truth, methods, figures."""
