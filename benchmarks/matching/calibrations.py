@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import warnings
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -62,11 +63,8 @@ def _detected(folder: Path, images: list[tuple[str, str, str]], grid: DiscGrid) 
     tables = []
     for camera, pose, image in images:
         for polarity in ("white-on-dark", "dark-on-white"):
-            own = DiscGrid(
-                grid.rows, grid.columns, grid.pitch_mm, grid.disc_diameter_mm, polarity, "upright"
-            )
             try:
-                target = Target.of(own)
+                target = Target.of(replace(grid, polarity=polarity))
                 tables.append(detect(folder / image, target=target, camera=camera, placement=pose))
                 break
             except DetectionError:

@@ -14,9 +14,10 @@ from closerange.position.positions import Positions
 from closerange.rig.camera import Camera
 from closerange.rig.distortion import BrownIdeal
 from closerange.rig.rig import Residuals, Rig, Trust
-from closerange.verification.acceptance import AcceptanceReport, Limits
+from closerange.verification.acceptance import AcceptanceReport
 from closerange.verification.control_check import ControlCheck, compare_with_control
 from closerange.verification.error_map import ErrorMap
+from closerange.verification.judgement import Limits
 from closerange.verification.lengths import LengthCheck, Lengths, length_test
 from closerange.verification.single_point import single_point_test
 

@@ -10,7 +10,7 @@ import pytest
 from closerange.errors import SchemaError
 from closerange.features.control import ControlPoints
 from closerange.position.positions import Positions
-from closerange.verification.acceptance import Limits
+from closerange.verification.judgement import Limits
 from closerange.verification.control_check import compare_with_control
 from closerange.verification.lengths import Lengths, length_test
 from closerange.verification.result_file import plain, read_result, write_result

@@ -12,7 +12,7 @@ from closerange.features.control import ControlPoints
 from closerange.flags import Flag
 from closerange.position.measure import measure_points
 from closerange.position.positions import Positions
-from closerange.verification.acceptance import Limits
+from closerange.verification.judgement import Limits
 from closerange.verification.scenes import observe, random_positions, rig_b
 from closerange.verification.single_point import single_point_test
 

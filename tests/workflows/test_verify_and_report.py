@@ -12,8 +12,9 @@ from closerange.errors import (
 )
 from closerange.features.control import ControlPoints, write_control
 from closerange.position.positions import Positions
-from closerange.verification.acceptance import AcceptanceReport, Limits
+from closerange.verification.acceptance import AcceptanceReport
 from closerange.verification.control_check import ControlCheck
+from closerange.verification.judgement import Limits
 from closerange.verification.lengths import LengthCheck, Lengths
 from closerange.verification.result_file import write_result
 from closerange.workflows.report import report

@@ -16,13 +16,8 @@ from closerange.geometry.arrays import BoolArray, FloatArray
 from closerange.geometry.interpolation import bilinear
 from closerange.matching.candidates import Candidates
 from closerange.matching.depth_table import MISFIT_LIMIT_PX, DepthTable
+from closerange.matching.element_weights import best_rows, support
 from closerange.rig.camera import Camera
-
-WINDOW_SHARES = (0.022, 0.045)
-"""Half-widths of the two square structuring elements per image width. Small parts of a picture
-that shows whole parts are a fiftieth of it wide; the larger element tells repeated small ones
-apart. Two sizes with equal weight beat each alone on three quite different scenes
-(correspondence report, 'averaged')."""
 
 TURN_RAD = 0.4
 """Angle between expected and found direction that counts as much as one pixel of misfit: an edge
@@ -86,7 +81,7 @@ def unary_cost(
 ) -> FloatArray:
     """Return the cost of each candidate, in pixels of misfit, shape (M,).
 
-    Three terms: how well the edges within two structuring elements around the point fit at the
+    Three terms: how well the edges within the structuring elements of the point fit at the
     candidate's height (or, for an edge that may run along the sweep axis, how well its chain fits
     there); how far the edge is turned; how much the grey of the more similar side differs. The
     nearer surface is on one side only, hence the better side is what counts.
@@ -113,11 +108,7 @@ def unary_cost(
         return np.zeros(0)
     turned = np.clip(turn(first, candidates) / TURN_RAD, 0.0, MISFIT_LIMIT_PX)
     table = DepthTable.of(len(first), candidates, turned, axis)
-    width = first.size_px[0]
-    support = np.mean(
-        [table.support(first.xy_px, candidates, share * width) for share in WINDOW_SHARES], axis=0
-    )
-    cost = support + TURN_WEIGHT * turned
+    cost = support(first, candidates, table) + TURN_WEIGHT * turned
     upright, slope = _upright(first, candidates)
     if upright.any():
         rows = candidates.select(upright)
@@ -157,8 +148,7 @@ def side_cost(
     # across the crossed chain, towards its brighter side
     normal = np.column_stack([candidates.tangent[:, 1], -candidates.tangent[:, 0]])
     beside_2 = _sides(greys[1], candidates.xy_px, normal)
-    order = np.lexsort((cost, candidates.point))
-    best = order[np.r_[True, np.diff(candidates.point[order]) > 0]]
+    best = best_rows(cost, candidates.point)
     best = best[cost[best] < GOOD_PX]
     gain, offset = _brightness(beside_1[best].ravel(), beside_2[best].ravel())
     scale = np.ptp(np.quantile(greys[1], [0.001, 0.999]))

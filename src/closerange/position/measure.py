@@ -79,9 +79,7 @@ def measure_points(rig: Rig, points: ImagePoints) -> Positions:
     rms = _rms(observed, solution)
     doubt = _doubt(rig, points, observed, found, rms)
     if doubt is not None:
-        warnings.warn(
-            doubt.text, DoubtWarning if doubt.grave else CloseRangeWarning, stacklevel=2
-        )
+        warnings.warn(doubt.text, DoubtWarning if doubt.grave else CloseRangeWarning, stacklevel=2)
     flags = observed.flags | found | (0 if rig.trusted else int(Flag.untrusted))
     defined = all_finite(solution.xyz_mm, 1)
     return Positions(

@@ -146,7 +146,7 @@ def _exchanges(rig: Rig, points: ImagePoints) -> Iterator[tuple[str, ImagePoints
         if moved:
             exchanged = tuple(given[name] for name in points.camera)
             other = replace(points, camera=exchanged, size_px={})
-            yield f"the cameras' images seem exchanged: with {moved}", other
+            yield f"the cameras' images seem exchanged: with {moved},", other
 
 
 def _scalings(points: ImagePoints) -> Iterator[tuple[str, ImagePoints]]:
@@ -156,4 +156,4 @@ def _scalings(points: ImagePoints) -> Iterator[tuple[str, ImagePoints]]:
     for scale in SCALES:
         xy = (points.xy_px + 0.5) * scale - 0.5
         other = replace(points, xy_px=xy, cov_px2=scale**2 * points.cov_px2)
-        yield f"the images seem to be of another size: with x_px, y_px times {scale:g}", other
+        yield f"the images seem to be of another size: with x_px, y_px times {scale:g},", other

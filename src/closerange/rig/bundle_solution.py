@@ -11,7 +11,7 @@ from closerange.errors import CloseRangeWarning, GeometryError
 from closerange.geometry.arrays import BoolArray, FloatArray, IntArray
 from closerange.rig.bundle import Bundle, BundleFit, Sightings
 from closerange.rig.bundle_outliers import fit_bundle_without_blunders
-from closerange.rig.bundle_start import CONTRADICTS, MIN_POINTS, posed, start_bundle
+from closerange.rig.bundle_start import MIN_POINTS, posed, start_bundle
 from closerange.rig.models import Model
 from closerange.rig.observations import Observations, listed, without_disc_bias
 from closerange.rig.outliers import MAX_SHARE, ROUNDING_PX
@@ -186,7 +186,7 @@ def solve_bundle(placed: Placed, model: Model) -> BundleSolution:
         others.
     """
     observations, xy = placed.observations, placed.observations.points.xy_px
-    start = start_bundle(placed.sightings(xy), observations.size_px, placed.placements, model.free)
+    start = start_bundle(placed.sightings(xy), observations.size_px, model.free)
     solution = _settle(placed, xy, start)
     bundle = solution.fit.bundle
     corrected = without_disc_bias(placed.in_world(bundle), bundle.cameras)
@@ -243,5 +243,7 @@ def _require_agreement(solution: BundleSolution) -> None:
             f"camera {placed.observations.cameras[camera]!r}, placement "
             f"{placed.placements[placement]!r}: {out[number]} of {count[number]} points contradict "
             "those of the other images",
-            remedy=CONTRADICTS,
+            remedy="are the points of one image of this placement named in another order, did the "
+            "target move between the exposures of the cameras, or is it another placement's image? "
+            "Correct it or leave the placement out",
         )

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import replace
 
 import cv2
@@ -23,21 +23,12 @@ MIN_PLACEMENTS = 3
 """Placements that a plane needs for focal length and principal point (Zhang 2000,
 doi:10.1109/34.888718)."""
 
-MISPLACED = 0.25
-"""Largest median miss of an image's points, as a share of the target's size in it: a usual start
-errs by a hundredth, points named in another order by the target's own size."""
-
-CONTRADICTS = (
-    "are the points of one image of this placement named in another order, did the target move "
-    "between the exposures of the cameras, or is it another placement's image? Correct it or leave "
-    "the placement out"
-)
+IDENTITY = RigidTransform(np.eye(3), np.zeros(3))
 
 
 def start_bundle(
     seen: Sightings,
     sizes: Mapping[str, tuple[int, int]],
-    placements: Sequence[str],
     free: tuple[str, ...],
 ) -> Bundle:
     """Find cameras and poses of all placements.
@@ -48,8 +39,6 @@ def start_bundle(
         Points; the first placement becomes the world.
     sizes : mapping of str to (int, int)
         Image width and height of each camera, in the order of their indices.
-    placements : sequence of str
-        Names.
     free : tuple of str
         Parameters to be estimated; the start has no others.
 
@@ -61,8 +50,7 @@ def start_bundle(
     Raises
     ------
     GeometryError
-        If a camera sees too few placements, cannot be linked to the first placement, or sees a
-        placement in another pose than the other cameras do.
+        If a camera sees too few placements, or shares none with the others.
     """
     cameras: list[Camera] = []
     poses: list[dict[int, RigidTransform]] = []  # camera from target, by placement
@@ -74,12 +62,21 @@ def start_bundle(
                 f"{MIN_PLACEMENTS} are needed",
                 remedy="show the target in more, differently tilted poses",
             )
-        camera = Camera(name, size, np.eye(3), RigidTransform(np.eye(3), np.zeros(3)))
-        camera, found = _mono(seen, i, own, camera, free)
+        camera = Camera(name, size, np.eye(3), IDENTITY)
+        camera, alone = _mono(seen, i, own, camera, free)
         cameras.append(camera)
-        poses.append(found)
+        poses.append(alone)
     located = _linked(cameras, poses, seen.target_mm)
-    return Bundle(located, tuple(_poses(located, seen, poses, placements)), free)
+    found = _poses(located, seen, poses)
+    world = found[0].inverse()
+    return Bundle(
+        tuple(
+            replace(camera, camera_from_world=camera.camera_from_world.after(found[0]))
+            for camera in located
+        ),
+        (IDENTITY, *(world.after(pose) for pose in found[1:])),
+        free,
+    )
 
 
 def posed(seen: Sightings, camera: int) -> list[int]:
@@ -95,9 +92,8 @@ def posed(seen: Sightings, camera: int) -> list[int]:
 def _linked(
     cameras: list[Camera], poses: list[dict[int, RigidTransform]], target_mm: FloatArray
 ) -> tuple[Camera, ...]:
-    """Carry the first placement's frame from camera to camera through placements they share."""
-    world: dict[int, RigidTransform] = {0: RigidTransform(np.eye(3), np.zeros(3))}
-    placed: dict[int, Camera] = {}
+    """Carry the first camera's frame from camera to camera through placements they share."""
+    world, placed = poses[0].copy(), {0: cameras[0]}
     while len(placed) < len(cameras):
         waiting = [i for i in range(len(cameras)) if i not in placed]
         ready = [i for i in waiting if poses[i].keys() & world.keys()]
@@ -140,38 +136,24 @@ def _poses(
     cameras: tuple[Camera, ...],
     seen: Sightings,
     poses: list[dict[int, RigidTransform]],
-    names: Sequence[str],
 ) -> list[RigidTransform]:
-    """Return world from target: of what the cameras say, that which suits all of them best.
+    """Return where the target is: of what the cameras say, that which suits all of them best.
 
     A small flat target looks nearly alike in two poses, and one camera may take the wrong one.
     """
-    found = [RigidTransform(np.eye(3), np.zeros(3))]
-    for placement in range(len(names)):
+    found = []
+    for placement in range(int(seen.placement.max()) + 1):
         rows = seen.select(seen.placement == placement)
         candidates = [
             camera.camera_from_world.inverse().after(own[placement])
             for camera, own in zip(cameras, poses, strict=True)
             if placement in own
         ]
-        if placement == 0:
-            candidates = found.copy()
         misses = [
-            [_miss(camera, i, pose, rows) for i, camera in enumerate(cameras)]
+            sum(_miss(camera, i, pose, rows) for i, camera in enumerate(cameras))
             for pose in candidates
         ]
-        best = int(np.argmin(np.sum(misses, axis=1)))
-        worst = int(np.argmax(misses[best]))
-        if misses[best][worst] > MISPLACED:
-            raise GeometryError(
-                f"camera {cameras[worst].name!r} and the other cameras see placement "
-                f"{names[placement]!r} in different poses: the points lie "
-                f"{100 * misses[best][worst]:.0f} % of the target's size in the image from where "
-                f"they should (limit {100 * MISPLACED:.0f} %)",
-                remedy=CONTRADICTS,
-            )
-        if placement:
-            found.append(candidates[best])
+        found.append(candidates[int(np.argmin(misses))])
     return found
 
 

@@ -2,17 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Any
 
-import numpy as np
-from numpy.typing import ArrayLike
-
-from closerange.errors import InputError
 from closerange.flags import format_flags
 from closerange.geometry.arrays import FloatArray, IntArray, frozen_array, frozen_ints
+from closerange.verification.judgement import Judgement, Limits
 from closerange.verification.result_file import plain
+from closerange.verification.standing import hollow_text
 from closerange.verification.statistics import (
     AXES,
     AxisSlopes,
@@ -33,96 +30,6 @@ _ROWS = (
     "predicted_cov_mm2",
     "flags",
 )
-ACCEPT, REJECT, UNDECIDED = "accept", "reject", "undecided"
-
-GUARD = 1.65
-"""One-sided 95 % point of the normal distribution: guard band in standard uncertainties."""
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Limits:
-    """Largest figures that the buyer accepts.
-
-    Attributes
-    ----------
-    accuracy_mm : ndarray, shape (3,)
-        Of abs(error) of any position's mean, along X, Y, Z; NaN = no limit.
-    repeatability_mm : ndarray, shape (3,)
-        Of the pooled standard deviation; NaN = no limit.
-    cycle_time_s : float
-        NaN = no limit.
-    """
-
-    accuracy_mm: FloatArray
-    repeatability_mm: FloatArray
-    cycle_time_s: float
-
-    def __post_init__(self) -> None:
-        for name in ("accuracy_mm", "repeatability_mm"):
-            object.__setattr__(self, name, frozen_array(getattr(self, name), (3,), name))
-
-    @classmethod
-    def of(
-        cls,
-        *,
-        accuracy_mm: ArrayLike | None = None,
-        repeatability_mm: ArrayLike | None = None,
-        cycle_time_s: float | None = None,
-    ) -> Limits:
-        """Build from what is limited.
-
-        Parameters
-        ----------
-        accuracy_mm, repeatability_mm : array_like, optional
-            One number for all axes, or one for each of X, Y, Z.
-        cycle_time_s : float, optional
-            Largest cycle time.
-
-        Returns
-        -------
-        Limits
-            What is not given has no limit.
-
-        Raises
-        ------
-        InputError
-            If a limit is not positive.
-        """
-        values: dict[str, FloatArray] = {
-            "accuracy_mm": _three(accuracy_mm, "accuracy_mm"),
-            "repeatability_mm": _three(repeatability_mm, "repeatability_mm"),
-            "cycle_time_s": np.array(np.nan if cycle_time_s is None else cycle_time_s),
-        }
-        for name, value in values.items():
-            if np.any(value <= 0):
-                raise InputError(f"limit {name} is {value}", remedy="limits must exceed 0")
-        return cls(values["accuracy_mm"], values["repeatability_mm"], float(values["cycle_time_s"]))
-
-
-@dataclass(frozen=True, slots=True)
-class Judgement:
-    """One figure against its limit.
-
-    Attributes
-    ----------
-    name : str
-        Such as ``accuracy X``.
-    value, limit : float
-        Figure and limit, in `unit`.
-    guard : float
-        Guard band, in `unit`.
-    unit : str
-        ``mm`` or ``s``.
-    decision : str
-        ``accept``, ``reject`` or ``undecided``.
-    """
-
-    name: str
-    value: float
-    limit: float
-    guard: float
-    unit: str
-    decision: str
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -213,7 +120,8 @@ class AcceptanceReport:
     judgements : tuple of Judgement
         Each limited figure.
     decision : str or None
-        ``accept`` if all are, ``reject`` if one is, else ``undecided``; None without limits.
+        ``accept`` if all are and there are no reservations, ``reject`` if one is, else
+        ``undecided``; None without limits, unless most readings were left out.
     missing : tuple of (str, str, str)
         (placement, reading, point) without a truth.
     left_out : tuple of (str, str, str, str)
@@ -222,6 +130,13 @@ class AcceptanceReport:
         From the procedure of A15.05.
     warnings : tuple of str
         What the reader must know.
+    reservations : tuple of str
+        Why nothing is accepted, whatever the figures: readings that were left out, actual
+        positions without a usable reading, frozen images, an untrustworthy rig.
+    not_measured : tuple of (str, str)
+        (placement, point) of actual positions without a usable reading.
+    cycle_time_includes : str
+        What was timed; empty if it was not said.
     """
 
     placement: tuple[str, ...]
@@ -248,6 +163,9 @@ class AcceptanceReport:
     left_out: tuple[tuple[str, str, str, str], ...] = ()
     deviations: tuple[str, ...] = ()
     warnings: tuple[str, ...] = ()
+    reservations: tuple[str, ...] = ()
+    not_measured: tuple[tuple[str, str], ...] = ()
+    cycle_time_includes: str = ""
 
     def __post_init__(self) -> None:
         positions = len(self.point)
@@ -267,6 +185,12 @@ class AcceptanceReport:
         """Actual minus mean, shape (P, 3)."""
         return self.truth_mm - self.mean_mm
 
+    @property
+    def hollow(self) -> str:
+        """Why the figures stand on too few readings; empty where most were used."""
+        used, left_out = int(self.count.sum()), len(self.left_out)
+        return hollow_text(left_out, used + left_out, "readings")
+
     def __str__(self) -> str:
         accuracy, repeatability = self.accuracy.max_mm, self.repeatability.pooled.std_mm
         text = (
@@ -283,104 +207,6 @@ class AcceptanceReport:
         rows["flags"] = [format_flags(int(flag)) for flag in self.flags]
         signs = {"axes": list(AXES), "error_sign": "actual minus mean"}
         return {"kind": "single-point", **signs, "rows": rows, **document}
-
-
-def judge(name: str, value: float, limit: float, *, uncertainty: float, unit: str) -> Judgement:
-    """Decide on one figure with a guard band on either side of its limit.
-
-    Parameters
-    ----------
-    name : str
-        Of the figure.
-    value, limit : float
-        Figure and limit; an unknown figure (NaN) is undecided.
-    uncertainty : float
-        Standard uncertainty of the figure as a test value: of the reference, or of an estimate
-        from few readings, not of the instrument under test.
-    unit : str
-        For the report.
-
-    Returns
-    -------
-    Judgement
-        ISO 14253-1: accept within limit - g, reject beyond limit + g, g = 1.65 uncertainties
-        (95 %, one-sided), otherwise undecided.
-    """
-    guard = GUARD * uncertainty
-    decision = UNDECIDED
-    if value + guard <= limit:
-        decision = ACCEPT
-    elif value - guard > limit:
-        decision = REJECT
-    return Judgement(name, float(value), float(limit), float(guard), unit, decision)
-
-
-def judge_all(
-    accuracy: ErrorSummary,
-    pooled: PooledStd,
-    limits: Limits | None,
-    *,
-    reference_mm: float,
-    cycle_time_s: float,
-) -> tuple[Judgement, ...]:
-    """Judge every figure that has a limit.
-
-    Parameters
-    ----------
-    accuracy : ErrorSummary
-        Its largest absolute errors are judged, with the uncertainty of the reference.
-    pooled : PooledStd
-        Judged with its own uncertainty.
-    limits : Limits or None
-        None judges nothing.
-    reference_mm : float
-        Standard deviation of the actual positions.
-    cycle_time_s : float
-        NaN if unknown.
-
-    Returns
-    -------
-    tuple of Judgement
-        In the order accuracy, repeatability, cycle time.
-    """
-    if limits is None:
-        return ()
-    spread = pooled.std_mm * pooled.relative_uncertainty
-    figures = [
-        (f"accuracy {axis}", accuracy.max_mm[i], limits.accuracy_mm[i], reference_mm, "mm")
-        for i, axis in enumerate(AXES[:3])
-    ]
-    figures += [
-        (f"repeatability {axis}", pooled.std_mm[i], limits.repeatability_mm[i], spread[i], "mm")
-        for i, axis in enumerate(AXES[:3])
-    ]
-    figures.append(("cycle time", cycle_time_s, limits.cycle_time_s, 0.0, "s"))
-    return tuple(
-        judge(name, float(value), float(limit), uncertainty=float(uncertainty), unit=unit)
-        for name, value, limit, uncertainty, unit in figures
-        if not np.isnan(limit)
-    )
-
-
-def overall_decision(decisions: Iterable[str]) -> str | None:
-    """Combine decisions: one rejection rejects, acceptance needs all, none gives None."""
-    found = set(decisions)
-    if not found:
-        return None
-    if REJECT in found:
-        return REJECT
-    return ACCEPT if found == {ACCEPT} else UNDECIDED
-
-
-def _three(value: ArrayLike | None, name: str) -> FloatArray:
-    """Spread one number, or check three; None becomes NaN."""
-    array = np.asarray(np.nan if value is None else value, dtype=np.float64)
-    if array.shape not in ((), (3,)):
-        raise InputError(
-            f"limit {name} has shape {array.shape}",
-            remedy="give one number, or one for each of X, Y, Z",
-        )
-    return np.broadcast_to(array, (3,))
 
 
 def _axes(value_mm: FloatArray) -> str:

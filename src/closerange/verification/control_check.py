@@ -15,6 +15,7 @@ from closerange.flags import Flag, format_flags
 from closerange.geometry.arrays import FloatArray, IntArray, frozen_array, frozen_ints
 from closerange.position.positions import Positions
 from closerange.verification.result_file import plain
+from closerange.verification.standing import hollow_text, without_reading
 from closerange.verification.statistics import (
     AXES,
     Coverage,
@@ -145,6 +146,11 @@ class ControlCheck:
     def __len__(self) -> int:
         return len(self.point)
 
+    @property
+    def hollow(self) -> str:
+        """Why the averages stand on too few rows; empty where most were used."""
+        return hollow_text(len(self.left_out), len(self), "rows with a true position")
+
     def __str__(self) -> str:
         texts = []
         for name, group in self.groups.items():
@@ -231,7 +237,7 @@ def compare_with_control(
         systematic=systematic_errors(rows.select(used), error[used]),
         missing=tuple(key for key, has in zip(positions.keys(), known, strict=True) if not has),
         left_out=left_out_rows(rows, used),
-        not_measured=_not_measured(rows, control),
+        not_measured=without_reading(rows, rows.measured, control),
     )
 
 
@@ -342,10 +348,3 @@ def _inside(original_mm: FloatArray, volume_mm: ArrayLike | None) -> NDArray[np.
         (original_mm >= lower - slack) & (original_mm <= upper + slack)
     ).all(axis=1)
     return within
-
-
-def _not_measured(rows: Positions, control: ControlPoints) -> tuple[tuple[str, str], ...]:
-    measured = rows.select(rows.measured)
-    hit = set(control.rows_for(measured.placement, measured.point).tolist())
-    keys = zip(control.placement, control.point, strict=True)
-    return tuple(key for row, key in enumerate(keys) if row not in hit)

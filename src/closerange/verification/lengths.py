@@ -18,6 +18,7 @@ from closerange.geometry.arrays import FloatArray, IntArray, frozen_array, froze
 from closerange.position.positions import Positions
 from closerange.verification.control_check import usable
 from closerange.verification.result_file import plain
+from closerange.verification.standing import hollow_text
 
 REQUIRED = ("point_a", "point_b", "length_mm")
 OPTIONAL = ("placement", "std_mm")
@@ -113,7 +114,10 @@ class LengthCheck:
     ratio : float
         RMS of error / predicted; 1 if the prediction holds. NaN if unknown.
     missing : tuple of (str, str, str)
-        (placement, point_a, point_b) of lengths that were not measured.
+        (placement, point_a, point_b) of lengths that were not measured: in no placement, or not
+        in one whose table lists both ends.
+    reservations : tuple of str
+        What was not compared: nothing is known of it, however good the rest.
     """
 
     placement: tuple[str, ...]
@@ -131,6 +135,7 @@ class LengthCheck:
     max_mm: float
     ratio: float
     missing: tuple[tuple[str, str, str], ...] = ()
+    reservations: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
         count = len(self.point_a)
@@ -143,6 +148,12 @@ class LengthCheck:
 
     def __len__(self) -> int:
         return len(self.point_a)
+
+    @property
+    def hollow(self) -> str:
+        """Why the figures stand on too few lengths; empty where most were used."""
+        lost = int((~self.used).sum()) + len(self.missing)
+        return hollow_text(lost, len(self) + len(self.missing), "lengths")
 
     def __str__(self) -> str:
         return (
@@ -217,18 +228,15 @@ def length_test(positions: Positions, truth: Lengths) -> LengthCheck:
             f"none of {len(truth)} lengths has both ends among the {len(positions)} positions",
             remedy="use the same names of placements and points in both tables",
         )
-    if missing:
-        warnings.warn(
-            f"{len(missing)} of {len(truth)} lengths were not measured",
-            CloseRangeWarning,
-            stacklevel=2,
-        )
     difference = positions.xyz_mm[row_b] - positions.xyz_mm[row_a]
     measured = np.linalg.norm(difference, axis=1)
     error = measured - truth.length_mm[row_truth]
     predicted = _predicted_std(positions, row_a, row_b, truth.std_mm[row_truth])
     good = usable(positions)
     used = good[row_a] & good[row_b]
+    reservations = _reservations(used, len(missing))
+    for text in reservations:
+        warnings.warn(text, CloseRangeWarning, stacklevel=2)
     known = used & (predicted > 0)
     return LengthCheck(
         placement=tuple(positions.placement[i] for i in row_a),
@@ -246,29 +254,41 @@ def length_test(positions: Positions, truth: Lengths) -> LengthCheck:
         max_mm=float(np.abs(error[used]).max()) if used.any() else np.nan,
         ratio=_rms(error[known] / predicted[known]),
         missing=missing,
+        reservations=reservations,
     )
+
+
+def _reservations(used: NDArray[np.bool_], missing: int) -> tuple[str, ...]:
+    """Say what was not compared."""
+    left_out, total = int((~used).sum()), len(used) + missing
+    found = [
+        (missing, f"{missing} of {total} lengths were not measured"),
+        (left_out, f"{left_out} of {total} lengths have a flagged end and were left out"),
+    ]
+    return tuple(text for applies, text in found if applies)
 
 
 def _pair_rows(
     positions: Positions, truth: Lengths
 ) -> tuple[IntArray, IntArray, IntArray, tuple[tuple[str, str, str], ...]]:
-    """Find the rows of both ends of each length, in every placement and reading that has them."""
+    """Find the rows of both ends of each length, in every placement and reading that lists them."""
     index: dict[tuple[str, str], dict[str, int]] = {}
     for row, (placement, reading, point) in enumerate(positions.keys()):
-        if positions.measured[row]:
-            index.setdefault((placement, reading), {})[point] = row
+        index.setdefault((placement, reading), {})[point] = row
+    measured = positions.measured
     found: list[tuple[int, int, int]] = []
     missing = []
     for i, (where, a, b) in enumerate(
         zip(truth.placement, truth.point_a, truth.point_b, strict=True)
     ):
-        hits = [
-            (rows[a], rows[b], i)
+        listed = [
+            (placement, rows[a], rows[b])
             for (placement, _), rows in index.items()
             if where in ("", placement) and a in rows and b in rows
         ]
-        found += hits
-        if not hits:
+        found += [(x, y, i) for _, x, y in listed if measured[x] and measured[y]]
+        missing += [(name, a, b) for name, x, y in listed if not (measured[x] and measured[y])]
+        if not listed:
             missing.append((where, a, b))
     row_a, row_b, row_truth = np.array(found, dtype=np.int64).reshape(-1, 3).T
     return row_a, row_b, row_truth, tuple(missing)

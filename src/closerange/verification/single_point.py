@@ -6,29 +6,23 @@ import warnings
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from closerange.errors import CloseRangeWarning, DataError, InputError
 from closerange.features.control import ControlPoints
 from closerange.flags import Flag
-from closerange.geometry.arrays import FloatArray, IntArray
+from closerange.geometry.arrays import FloatArray
 from closerange.geometry.covariance import (
     limited_part,
     mahalanobis_squared,
     positive_definite,
 )
 from closerange.position.positions import Positions
-from closerange.verification.acceptance import (
-    ACCEPT,
-    UNDECIDED,
-    AcceptanceReport,
-    Limits,
-    Prediction,
-    Repeatability,
-    judge_all,
-    overall_decision,
-)
+from closerange.verification.acceptance import AcceptanceReport, Prediction, Repeatability
 from closerange.verification.control_check import left_out_rows, usable
+from closerange.verification.judgement import UNDECIDED, Limits, judge_all, overall_decision
+from closerange.verification.reading_groups import Groups, group_readings
+from closerange.verification.standing import hollow_text, without_reading
 from closerange.verification.statistics import (
     ErrorSummary,
     LuckOfTest,
@@ -49,33 +43,12 @@ REFERENCE_RATIO = 4.0
 """How many times better than the limit a reference must be to prove anything about it."""
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class _Groups:
-    """Readings by position; P positions of N used rows."""
-
-    key: tuple[tuple[str, str], ...]
-    group: IntArray  # (N,) position of each row
-    count: IntArray  # (P,)
-    mean: FloatArray  # (P, 3)
-    deviation: FloatArray  # (N, 3) of each row from its mean
-    std: FloatArray  # (P, 3), NaN for one reading
-    range: FloatArray  # (P, 3), NaN for one reading
-    flags: IntArray  # (P,)
-    frozen: NDArray[np.bool_]  # (P,)
-    total: FloatArray  # (P, 3, 3) predicted covariance of one reading
-    noise: FloatArray | None  # (P, 3, 3) the part of it that differs between readings
-
-    @property
-    def scatter_count(self) -> IntArray:
-        """Readings that tell about repeatability: none of a frozen position."""
-        return np.where(self.frozen, 0, self.count)
-
-
 def single_point_test(
     positions: Positions,
     truth: ControlPoints,
     *,
     cycle_time_s: float | None = None,
+    cycle_time_includes: str = "",
     limits: Limits | None = None,
     gauge_std_mm: float | None = None,
     noise_cov_mm2: ArrayLike | None = None,
@@ -91,8 +64,11 @@ def single_point_test(
         Actual positions.
     cycle_time_s : float, optional
         Time from the command to the result.
+    cycle_time_includes : str, optional
+        What was timed, if it is less than that.
     limits : Limits, optional
-        Gives a decision.
+        Gives a decision. Nothing is accepted while a reading is left out or has no actual
+        position, or an actual position has no usable reading.
     gauge_std_mm : float, optional
         Standard deviation of the actual positions; replaces the `std_mm` of `truth`.
     noise_cov_mm2 : array_like, shape (M, 3, 3), optional
@@ -123,13 +99,16 @@ def single_point_test(
             remedy="use the same names of placements and points in both tables",
         )
     stated = positions.noise_cov_mm2 if noise_cov_mm2 is None else noise_cov_mm2
-    groups = _group(positions, known & good, stated)
+    groups = group_readings(positions, known & good, stated)
     row = truth.rows_for(*zip(*groups.key, strict=True))
     reference = np.full(len(row), gauge_std_mm) if gauge_std_mm is not None else truth.std_mm[row]
     notes = _Notes(
         missing=tuple(key for key, has in zip(positions.keys(), known, strict=True) if not has),
         left_out=left_out_rows(positions.select(known), good[known]),
+        not_measured=without_reading(positions, good, truth),
+        truths=len(truth),
         cycle_time_s=np.nan if cycle_time_s is None else float(cycle_time_s),
+        cycle_time_includes=cycle_time_includes,
         dof=positions.dof,
     )
     report = _evaluate(groups, truth.xyz_mm[row], reference, limits, notes)
@@ -144,57 +123,15 @@ class _Notes:
 
     missing: tuple[tuple[str, str, str], ...]
     left_out: tuple[tuple[str, str, str, str], ...]
+    not_measured: tuple[tuple[str, str], ...]
+    truths: int
     cycle_time_s: float
+    cycle_time_includes: str
     dof: int | None
 
 
-def _group(positions: Positions, used: NDArray[np.bool_], noise_cov: ArrayLike) -> _Groups:
-    rows = positions.select(used)
-    keys = list(zip(rows.placement, rows.point, strict=True))
-    found = set(keys)
-    # in the order of the table, whichever of their readings are left out
-    order = dict.fromkeys(zip(positions.placement, positions.point, strict=True))
-    number = {key: i for i, key in enumerate(key for key in order if key in found)}
-    group = np.array([number[key] for key in keys])
-    count = np.bincount(group)
-    mean = _mean_of(rows.xyz_mm, group, count)
-    deviation = rows.xyz_mm - mean[group]
-    squares = _mean_of(deviation**2, group, count)
-    low, high = np.full_like(mean, np.inf), np.full_like(mean, -np.inf)
-    np.minimum.at(low, group, rows.xyz_mm)
-    np.maximum.at(high, group, rows.xyz_mm)
-    several = (count > 1)[:, None]
-    bessel = count[:, None] / np.maximum(count - 1, 1)[:, None]
-    frozen = (count > 1) & (high == low).all(axis=1)
-    flags = np.where(frozen, int(Flag.frozen), 0)
-    np.bitwise_or.at(flags, group, rows.flags)
-    stated = np.broadcast_to(np.asarray(noise_cov, np.float64), (len(positions), 3, 3))[used]
-    return _Groups(
-        key=tuple(number),
-        group=group,
-        count=count,
-        mean=mean,
-        deviation=deviation,
-        # equal readings differ from their rounded mean: a frozen position has exactly no scatter
-        std=np.where(several, np.where(frozen[:, None], 0.0, np.sqrt(squares * bessel)), np.nan),
-        range=np.where(several, high - low, np.nan),
-        flags=flags,
-        frozen=frozen,
-        total=_mean_of(rows.cov_mm2, group, count),
-        noise=_mean_of(stated, group, count) if np.isfinite(stated).all() else None,
-    )
-
-
-def _mean_of(values: FloatArray, group: IntArray, count: IntArray) -> FloatArray:
-    """Average rows by group."""
-    total = np.zeros((len(count), *values.shape[1:]))
-    np.add.at(total, group, values)
-    mean: FloatArray = total / count.reshape(-1, *(1,) * (values.ndim - 1))
-    return mean
-
-
 def _evaluate(
-    groups: _Groups,
+    groups: Groups,
     truth: FloatArray,
     reference: FloatArray,
     limits: Limits | None,
@@ -212,8 +149,11 @@ def _evaluate(
         reference_mm=float(reference.max()),
         cycle_time_s=notes.cycle_time_s,
     )
-    decision = overall_decision(item.decision for item in judgements)
-    marked = bool((groups.flags & int(Flag.frozen | Flag.untrusted)).any())
+    reservations = _reservations(groups, notes)
+    decision = overall_decision((item.decision for item in judgements), reserved=bool(reservations))
+    used, left_out = int(groups.count.sum()), len(notes.left_out)
+    if decision is None and hollow_text(left_out, used + left_out, "readings"):
+        decision = UNDECIDED
     return AcceptanceReport(
         placement=tuple(placement for placement, _ in groups.key),
         point=tuple(point for _, point in groups.key),
@@ -234,15 +174,18 @@ def _evaluate(
         cycle_time_s=notes.cycle_time_s,
         limits=limits,
         judgements=judgements,
-        decision=UNDECIDED if marked and decision == ACCEPT else decision,
+        decision=decision,
         missing=notes.missing,
         left_out=notes.left_out,
         deviations=_deviations(groups, truth, reference, notes),
-        warnings=_warnings(groups, accuracy, float(reference.max()), limits, notes),
+        warnings=(*_warnings(groups, accuracy, float(reference.max()), limits), *reservations),
+        reservations=reservations,
+        not_measured=notes.not_measured,
+        cycle_time_includes=notes.cycle_time_includes,
     )
 
 
-def _noise_share(groups: _Groups) -> float:
+def _noise_share(groups: Groups) -> float:
     """Return which share of a reading's predicted variance differs between readings."""
     if groups.noise is not None:
         variances = [np.trace(cov, axis1=1, axis2=2).sum() for cov in (groups.noise, groups.total)]
@@ -250,7 +193,7 @@ def _noise_share(groups: _Groups) -> float:
     return float(np.clip(_scatter_ratio(groups), 0.0, 1.0))
 
 
-def _scatter_ratio(groups: _Groups) -> float:
+def _scatter_ratio(groups: Groups) -> float:
     """Return the pooled observed variance relative to the whole predicted one; NaN if unknown."""
     kept = positive_definite(groups.total) & (groups.scatter_count > 1)
     if not kept.any():
@@ -259,7 +202,7 @@ def _scatter_ratio(groups: _Groups) -> float:
     return float(square[kept[groups.group]].sum() / (3 * (groups.count[kept] - 1).sum()))
 
 
-def _predicted_of_mean(groups: _Groups, share: float) -> FloatArray:
+def _predicted_of_mean(groups: Groups, share: float) -> FloatArray:
     """Predict the covariance of the mean of M readings: only the noise is averaged."""
     averaged = (1 - 1 / groups.count)[:, None, None]
     if groups.noise is not None:
@@ -269,7 +212,7 @@ def _predicted_of_mean(groups: _Groups, share: float) -> FloatArray:
 
 
 def _prediction(
-    groups: _Groups,
+    groups: Groups,
     share: float,
     error: FloatArray,
     predicted: FloatArray,
@@ -305,7 +248,7 @@ def _worst(values: FloatArray) -> FloatArray:
     return known.max(axis=0) if len(known) else np.full(3, np.nan)
 
 
-def _luck(groups: _Groups) -> LuckOfTest:
+def _luck(groups: Groups) -> LuckOfTest:
     """Chance alone, for the commonest number of readings."""
     several = groups.scatter_count[groups.scatter_count > 1]
     readings = int(np.bincount(several).argmax()) if several.size else 0
@@ -317,7 +260,7 @@ def _luck(groups: _Groups) -> LuckOfTest:
 
 
 def _deviations(
-    groups: _Groups, truth: FloatArray, reference: FloatArray, notes: _Notes
+    groups: Groups, truth: FloatArray, reference: FloatArray, notes: _Notes
 ) -> tuple[str, ...]:
     """List what differs from A15.05 as section 3.2 of the thesis describes it."""
     fewest = int(groups.count.min())
@@ -330,11 +273,14 @@ def _deviations(
         (_in_steps(truth), "the positions lie in regular steps instead of at random"),
         (np.isnan(notes.cycle_time_s), "the cycle time is unknown"),
         (
+            bool(notes.cycle_time_includes),
+            f"the cycle time is not that from the command to the result: {notes.cycle_time_includes}",
+        ),
+        (
             not reference.any(),
             "the uncertainty of the actual positions is not stated; they are taken as exact",
         ),
-        (bool(notes.left_out), f"{len(notes.left_out)} flagged readings were left out"),
-        (bool(notes.missing), f"{len(notes.missing)} readings have no actual position"),
+        *((True, text) for text in _omissions(groups, notes)),
         (True, "target plate and test controller are not known to the program"),
         (True, "the procedure is that of the thesis, section 3.2; the standard was not at hand"),
     ]
@@ -348,14 +294,12 @@ def _in_steps(truth: FloatArray) -> bool:
 
 
 def _warnings(
-    groups: _Groups,
+    groups: Groups,
     accuracy: ErrorSummary,
     reference_mm: float,
     limits: Limits | None,
-    notes: _Notes,
 ) -> tuple[str, ...]:
-    single, frozen = int((groups.count == 1).sum()), int(groups.frozen.sum())
-    total = len(groups.key)
+    single, total = int((groups.count == 1).sum()), len(groups.key)
     strictest = np.nan if limits is None else np.fmin.reduce(limits.accuracy_mm)
     proved = float(accuracy.max_mm[:3].min() if np.isnan(strictest) else strictest)
     what = "accuracy found" if np.isnan(strictest) else "accuracy limit"
@@ -368,13 +312,6 @@ def _warnings(
             ),
         ),
         (
-            frozen,
-            (
-                f"all readings of {frozen} of {total} positions are equal: a frozen image, or a "
-                "resolution coarser than the noise; they are left out of the repeatability"
-            ),
-        ),
-        (
             reference_mm * REFERENCE_RATIO > proved,
             (
                 f"the reference ({reference_mm:.4g} mm) is not {REFERENCE_RATIO:.0f} times better "
@@ -382,11 +319,38 @@ def _warnings(
                 f"{REFERENCE_RATIO * reference_mm:.4g} mm"
             ),
         ),
+    ]
+    return tuple(text for applies, text in found if applies)
+
+
+def _reservations(groups: Groups, notes: _Notes) -> tuple[str, ...]:
+    """Say why nothing may be accepted."""
+    frozen = int(groups.frozen.sum())
+    found = [
+        (
+            frozen,
+            (
+                f"all readings of {frozen} of {len(groups.key)} positions are equal: a frozen "
+                "image, or a resolution coarser than the noise; they are left out of the "
+                "repeatability"
+            ),
+        ),
         (
             (groups.flags & int(Flag.untrusted)).any(),
             "the positions were measured with an untrustworthy rig: nothing is accepted",
         ),
-        (len(notes.left_out), f"{len(notes.left_out)} flagged readings were left out"),
-        (len(notes.missing), f"{len(notes.missing)} readings have no actual position"),
+    ]
+    marked = (text for applies, text in found if applies)
+    return (*marked, *_omissions(groups, notes))
+
+
+def _omissions(groups: Groups, notes: _Notes) -> tuple[str, ...]:
+    """Say what was not compared."""
+    left_out, missing, lost = len(notes.left_out), len(notes.missing), len(notes.not_measured)
+    total = int(groups.count.sum()) + left_out
+    found = [
+        (left_out, f"{left_out} of {total} readings are flagged and were left out"),
+        (missing, f"{missing} readings have no actual position"),
+        (lost, f"{lost} of {notes.truths} actual positions have no usable reading"),
     ]
     return tuple(text for applies, text in found if applies)

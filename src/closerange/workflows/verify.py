@@ -11,8 +11,9 @@ from closerange.position.positions import Positions
 from closerange.position.positions_table import read_positions
 from closerange.rig.rig import Rig
 from closerange.rig.rig_file import read_rig
-from closerange.verification.acceptance import AcceptanceReport, Limits
+from closerange.verification.acceptance import AcceptanceReport
 from closerange.verification.control_check import ControlCheck, compare_with_control
+from closerange.verification.judgement import Limits
 from closerange.verification.lengths import LengthCheck, Lengths, length_test, read_lengths
 from closerange.verification.single_point import single_point_test
 from closerange.verification.travel import truth_hints

@@ -12,7 +12,7 @@ import typer
 from closerange.errors import InputError
 
 if TYPE_CHECKING:
-    from closerange.verification.acceptance import Limits
+    from closerange.verification.judgement import Limits
 
 Json = Annotated[bool, typer.Option("--json", help="Print a machine-readable summary on stdout.")]
 Report = Annotated[
@@ -85,7 +85,7 @@ def limits(
     """Put permissible errors together; None if none is given."""
     if accuracy_mm is None and repeatability_mm is None:
         return None
-    from closerange.verification.acceptance import Limits
+    from closerange.verification.judgement import Limits
 
     return Limits.of(accuracy_mm=accuracy_mm, repeatability_mm=repeatability_mm)
 

@@ -1,0 +1,281 @@
+"""Structuring elements of the literal matcher: cut from image 1, carried into view 2, packed."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from closerange.errors import InputError
+from closerange.features.structuring import StructuringElement
+from closerange.geometry.arrays import BoolArray, FloatArray, IntArray, all_finite
+from closerange.matching.literal_words import SIDE, Words, bits_to_words, count_bits
+from closerange.rig.camera import Camera
+
+SHAPES = ("square", "disc", "cross")
+
+_NOWHERE = 10**6
+"""Stands for a pixel's place in view 2 that is none; no image is so long."""
+
+_BITS = 2**24
+"""Bytes of unpacked blocks that are held at once."""
+
+
+def footprint(size_px: int, shape: str = "square") -> BoolArray:
+    """Return which pixels around a candidate belong to its element.
+
+    Parameters
+    ----------
+    size_px : int
+        N, odd, 3 or more.
+    shape : {"square", "disc", "cross"}, optional
+        All N x N pixels as in the thesis; those within (N - 1) / 2 of the centre; or the middle
+        third of the rows and of the columns.
+
+    Returns
+    -------
+    ndarray of bool, shape (N, N)
+        True inside.
+
+    Raises
+    ------
+    InputError
+        If the size or the shape is none.
+    """
+    check_size(size_px)
+    if shape not in SHAPES:
+        raise InputError(
+            f"an element of shape {shape!r}", remedy=f"choose one of {', '.join(SHAPES)}"
+        )
+    if shape == "disc":
+        return StructuringElement.disc(size_px // 2).mask()[0]
+    box = np.ones((size_px, size_px), np.bool_)
+    if shape == "cross":
+        across = np.abs(np.arange(size_px) - size_px // 2) <= max(size_px // 6, 1)
+        box &= across[:, None] | across
+    return box
+
+
+def strip_footprint(size_px: int, tangent: tuple[float, float]) -> BoolArray:
+    """Return the pixels beside the straight line through a candidate along its edge.
+
+    Parameters
+    ----------
+    size_px : int
+        Length N, odd, 3 or more.
+    tangent : (float, float)
+        Unit vector x, y along the edge.
+
+    Returns
+    -------
+    ndarray of bool, shape (N, N)
+        Within (N - 1) / 2 of the centre along the line and a sixth of N across it: the strip has
+        a third of the square's pixels, as the cross has five ninths.
+
+    Raises
+    ------
+    InputError
+        If the size is none.
+    """
+    check_size(size_px)
+    reach = np.arange(size_px) - size_px // 2
+    along = tangent[0] * reach + tangent[1] * reach[:, None]
+    across = tangent[0] * reach[:, None] - tangent[1] * reach
+    inside = (np.abs(along) <= size_px // 2 + 1e-9) & (np.abs(across) <= max(size_px / 6, 1.0))
+    return np.asarray(inside)
+
+
+def check_size(size_px: int) -> None:
+    """Refuse elements without a centre pixel or without surroundings."""
+    if size_px != int(size_px) or size_px < 3 or size_px % 2 == 0:
+        raise InputError(
+            f"an element of {size_px} x {size_px} px",
+            remedy="give an odd whole number from 3 on: the candidate is the pixel in the middle",
+        )
+
+
+def farthest_plane(
+    camera_1: Camera, camera_2: Camera, volume_mm: FloatArray
+) -> tuple[int, float]:
+    """Return the face of the volume that lies farthest from the cameras.
+
+    Parameters
+    ----------
+    camera_1, camera_2 : Camera
+        Views.
+    volume_mm : ndarray, shape (2, 3)
+        Lower and upper corner; infinite on axes without limits.
+
+    Returns
+    -------
+    axis : int
+        World axis (0, 1, 2) along which both cameras look most nearly, of those with two limits.
+    offset_mm : float
+        Coordinate of the face: Z_upper of the thesis for cameras that look along Z.
+    """
+    forward = camera_1.camera_from_world.rotation[2] + camera_2.camera_from_world.rotation[2]
+    limited = np.isfinite(volume_mm).all(axis=0)
+    axis = int(np.argmax(np.where(limited, np.abs(forward), -1.0)))
+    return axis, float(volume_mm[1 if forward[axis] > 0 else 0, axis])
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class MappedElements:
+    """Elements in view 2, packed; M points, at most K blocks each.
+
+    Attributes
+    ----------
+    word, down, across : ndarray, shape (M, K)
+        Pixels of each block that has any, and the block's place from the candidate; the word is 0
+        beyond the last.
+    blocks, pixels : ndarray of int, shape (M,)
+        Number of blocks, and of different pixels of each element.
+    lowest, highest : ndarray of int, shape (M, 2)
+        Smallest and largest (row, column) from the candidate.
+    """
+
+    word: Words
+    down: NDArray[np.int32]
+    across: NDArray[np.int32]
+    blocks: IntArray
+    pixels: IntArray
+    lowest: IntArray
+    highest: IntArray
+
+    @property
+    def reach(self) -> int:
+        """Farthest that a block reaches from its candidate, in rows or columns."""
+        farthest = max(int(np.abs(edge).max(initial=0)) for edge in (self.lowest, self.highest))
+        return farthest + 2 * SIDE
+
+
+class EdgePixels:
+    """The edge pixels of image 1, each carried into view 2 once, whatever elements it is part of.
+
+    Parameters
+    ----------
+    camera_1, camera_2 : Camera
+        Views.
+    mask : ndarray of bool, shape (H, W)
+        Edge pixels of image 1.
+    plane : (int, float)
+        See `farthest_plane`.
+
+    Notes
+    -----
+    Equations (5.4) and (5.3).
+    """
+
+    def __init__(
+        self, camera_1: Camera, camera_2: Camera, mask: BoolArray, plane: tuple[int, float]
+    ) -> None:
+        self._cameras, self._plane = (camera_1, camera_2), plane
+        self._number = np.full(mask.shape, -1, np.int32)
+        row, column = np.nonzero(mask)
+        there = self.carried(np.column_stack([column, row]).astype(np.float64))
+        # a pixel that cannot be carried is no part of any element
+        known = all_finite(there, 1)
+        self._there = there[known].astype(np.float32)
+        self._number[row[known], column[known]] = np.arange(len(self._there), dtype=np.int32)
+
+    def carried(self, xy_px: FloatArray) -> FloatArray:
+        """Return where pixels of view 1 lie in view 2 through the plane; NaN if nowhere."""
+        axis, offset = self._plane
+        first, second = self._cameras
+        direction, centre = first.directions(xy_px), first.centre_mm
+        with np.errstate(divide="ignore", invalid="ignore"):
+            distance = (offset - centre[axis]) / direction[:, axis]
+        distance = np.where(np.isfinite(distance) & (distance > 0), distance, np.nan)
+        return second.project(centre + distance[:, None] * direction)
+
+    def elements(
+        self, pixel: IntArray, centre_px: FloatArray, inside: BoolArray
+    ) -> MappedElements:
+        """Cut the elements of candidates and carry them into view 2.
+
+        Parameters
+        ----------
+        pixel : ndarray of int, shape (M, 2)
+            Candidates x, y, in the image.
+        centre_px : ndarray, shape (M, 2)
+            Where `carried` puts them; an element is empty where this is NaN.
+        inside : ndarray of bool, shape (N, N)
+            Footprint.
+
+        Returns
+        -------
+        MappedElements
+            M elements. Places are rounded to whole pixels from the candidate's; those that fall
+            together are one. Pixels beyond the image do not exist.
+        """
+        point, number = self._covered(pixel, inside)
+        known = all_finite(centre_px, 1)
+        kept = known[point]
+        point, number = point[kept], number[kept]
+        centre = np.where(known[:, None], centre_px, 0.0).astype(np.float32)
+        away = self._there.take(number, axis=0) - centre.take(point, axis=0)
+        offset = np.rint(np.clip(away, -_NOWHERE, _NOWHERE)).astype(np.int32)[:, ::-1]
+        lowest, highest = _extents(point, offset, len(pixel))
+        return _packed(point, offset - lowest[point], lowest, highest)
+
+    def _covered(
+        self, pixel: IntArray, inside: BoolArray
+    ) -> tuple[NDArray[np.intp], NDArray[np.int32]]:
+        """Return pairs of candidate and edge pixel in its footprint, by candidate."""
+        reach = len(inside) // 2
+        padded = np.pad(self._number, reach, constant_values=-1)
+        row, column = np.nonzero(inside)
+        window = (row * padded.shape[1] + column).astype(np.int32)
+        corner = (pixel[:, 1] * padded.shape[1] + pixel[:, 0]).astype(np.int32)
+        found = padded.ravel().take(corner[:, None] + window)
+        place = np.flatnonzero(found.ravel() >= 0)
+        return place // len(window), found.ravel()[place]
+
+
+def _extents(
+    point: NDArray[np.intp], offset: NDArray[np.int32], count: int
+) -> tuple[IntArray, IntArray]:
+    """Return the smallest and the largest offset of each candidate; 0 without any."""
+    lowest, highest = np.zeros((count, 2), np.int64), np.zeros((count, 2), np.int64)
+    if len(point):
+        start = np.flatnonzero(np.diff(point, prepend=-1))
+        lowest[point[start]] = np.minimum.reduceat(offset, start, axis=0)
+        highest[point[start]] = np.maximum.reduceat(offset, start, axis=0)
+    return lowest, highest
+
+
+def _packed(
+    point: NDArray[np.intp], place: IntArray, lowest: IntArray, highest: IntArray
+) -> MappedElements:
+    """Pack pixels, counted from each element's own corner, by candidate."""
+    count = len(lowest)
+    down, across = ((highest - lowest).max(axis=0, initial=0) // SIDE + 1).tolist()
+    row, column = place[:, 0], place[:, 1]
+    block = (row // SIDE) * across + column // SIDE
+    bit = (row % SIDE) * SIDE + column % SIDE
+    word = np.zeros((count, down * across), np.uint64)
+    piece = max(_BITS // (64 * down * across), 1)
+    for first in range(0, count, piece):
+        low, high = np.searchsorted(point, (first, first + piece))
+        canvas = np.zeros((min(piece, count - first), down * across * 64), np.uint8)
+        canvas[point[low:high] - first, block[low:high] * 64 + bit[low:high]] = 1
+        word[first : first + piece] = bits_to_words(canvas)
+    return _without_empty(word, across, lowest, highest)
+
+
+def _without_empty(
+    word: Words, across: int, lowest: IntArray, highest: IntArray
+) -> MappedElements:
+    """Keep the blocks that have pixels, moved to the front of each row."""
+    point, block = np.nonzero(word)
+    blocks = np.bincount(point, minlength=len(word))
+    slot = np.arange(len(point)) - np.repeat(np.cumsum(blocks) - blocks, blocks)
+    shape = (len(word), int(blocks.max(initial=0)))
+    kept = np.zeros(shape, np.uint64)
+    rows, columns = np.zeros(shape, np.int32), np.zeros(shape, np.int32)
+    kept[point, slot] = word[point, block]
+    rows[point, slot] = lowest[point, 0] + SIDE * (block // across)
+    columns[point, slot] = lowest[point, 1] + SIDE * (block % across)
+    pixels = count_bits(kept).sum(axis=1, dtype=np.int64)
+    return MappedElements(kept, rows, columns, blocks, pixels, lowest, highest)
