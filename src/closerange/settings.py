@@ -19,6 +19,7 @@ Paths are relative to the project file and stay inside its folder. ::
     crops = "verify/crops.csv"
     verify = "single-point"
     truth = "verify/truth.csv"
+    limits = { accuracy_mm = [0.01, 0.01, 0.03], repeatability_mm = 0.01 }
 """
 
 from __future__ import annotations
@@ -36,6 +37,8 @@ SCHEMA = "closerange.project/1"
 
 Name = Annotated[str, Field(min_length=1)]
 Estimator = Literal["least-squares", "border-centroid"]
+Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
+PerAxis = Positive | Annotated[list[Positive], Field(min_length=3, max_length=3)]
 
 
 class _Table(BaseModel):
@@ -102,6 +105,32 @@ class Calibration(Detection):
     accept_untrusted: bool = False
 
 
+class JobLimits(_Table):
+    """Largest figures that the buyer accepts; with them a single-point test decides.
+
+    Attributes
+    ----------
+    accuracy_mm, repeatability_mm : float, list of float or None
+        One number for all axes, or three; see `closerange.verification.judgement.Limits`.
+    cycle_time_s : float or None
+        Of the program's own time for a reading, from the images on disk to the position. A clock
+        then has a part in the results: they are no longer the same byte for byte in every run.
+    confidence : float
+        Probability with which a decision is right at the very limit; sets the guard bands.
+    """
+
+    accuracy_mm: PerAxis | None = None
+    repeatability_mm: PerAxis | None = None
+    cycle_time_s: Positive | None = None
+    confidence: Annotated[float, Field(ge=0.5, lt=1)] = 0.95
+
+    @model_validator(mode="after")
+    def _something_is_limited(self) -> Self:
+        if (self.accuracy_mm, self.repeatability_mm, self.cycle_time_s) == (None, None, None):
+            raise ValueError("limits without any limit; remove them or state one")
+        return self
+
+
 class Job(Detection):
     """Something to measure and, if a truth is known, to verify.
 
@@ -113,16 +142,21 @@ class Job(Detection):
         ``control``, ``single-point`` or ``lengths``.
     truth : str or None
         Table of true positions or lengths.
+    limits : JobLimits or None
+        What a ``single-point`` test must keep.
     """
 
     name: Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9 ._-]*$")]
     verify: Literal["control", "single-point", "lengths"] | None = None
     truth: Name | None = None
+    limits: JobLimits | None = None
 
     @model_validator(mode="after")
     def _verify_needs_truth(self) -> Job:
         if (self.verify is None) != (self.truth is None):
             raise ValueError("verify and truth go together")
+        if self.limits is not None and self.verify != "single-point":
+            raise ValueError('limits are those of verify = "single-point"')
         return self
 
 

@@ -228,9 +228,14 @@ def _from_rows(contents: Contents) -> Iterator[Reason]:
             yield Reason(text, "against")
         else:
             yield Reason(f"no flag on any of {counted(total, 'measured position')}", "for")
-    missing = sum(len(check.get("missing") or ()) for check in contents.checks)
-    left_out = sum(len(check.get("left_out") or ()) for check in contents.checks)
-    for count, what in ((missing, "not measured"), (left_out, "left out of the comparison")):
+    reserved = [text for check in contents.checks for text in check.get("reservations") or ()]
+    yield from (Reason(text, "against") for text in dict.fromkeys(reserved))
+    others = [check for check in contents.checks if not check.get("reservations")]
+    for name, what in (
+        ("missing", "without a counterpart"),
+        ("left_out", "left out of the comparison"),
+    ):
+        count = sum(len(check.get(name) or ()) for check in others)
         if count:
             yield Reason(f"{counted(count, 'row')} {what}", "against")
     if contents.notes:

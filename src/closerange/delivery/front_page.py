@@ -145,9 +145,9 @@ def _from_checks(contents: Contents) -> Verdict | None:
         rms, largest = (float(numbers(check[name])) for name in ("rms_mm", "max_mm"))
         text = (
             f"{counted(used, 'length')}: rms error {short_length(rms)}, "
-            f"largest {short_length(largest)}."
+            f"largest {short_length(largest)}"
         )
-        return Verdict(text, _trust_tone(contents))
+        return _reserved(text, check, _trust_tone(contents))
     return None
 
 
@@ -167,10 +167,19 @@ def _single_point_verdict(check: Mapping[str, Any]) -> Verdict:
         return Verdict(f"Accepted: {figures}; every figure is within its limit.", "good")
     if decision in ("reject", "undecided"):
         broken = [item for item in check["judgements"] if item["decision"] == decision]
-        names = ", ".join(_against_limit(item) for item in broken)
-        reason = names or "the readings carry a flag that forbids acceptance"
+        reasons = [", ".join(_against_limit(item) for item in broken)] if broken else []
+        reasons += check.get("reservations") or () if decision == "undecided" else ()
+        reason = "; ".join(reasons) or "the readings carry a flag that forbids acceptance"
         return Verdict(f"{DECISIONS[decision].capitalize()}: {reason}.", _TONES[decision])
-    return Verdict(f"{figures[0].upper()}{figures[1:]}; no limits were agreed.", "")
+    return _reserved(f"{figures[0].upper()}{figures[1:]}; no limits were agreed", check, "")
+
+
+def _reserved(text: str, check: Mapping[str, Any], tone: str) -> Verdict:
+    """Add to a sentence what was not compared; the rest being good says nothing about it."""
+    reservations = check.get("reservations") or ()
+    if not reservations:
+        return Verdict(f"{text}.", tone)
+    return Verdict(f"{text}; but {'; '.join(reservations)}.", "bad" if tone == "bad" else "warn")
 
 
 def _against_limit(item: Mapping[str, Any]) -> str:

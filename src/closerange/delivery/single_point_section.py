@@ -7,7 +7,15 @@ from typing import Any
 
 import numpy as np
 
-from closerange.delivery.excerpts import DECISIONS, coverage_text, four, left_out, numbers, shown
+from closerange.delivery.excerpts import (
+    DECISIONS,
+    coverage_text,
+    four,
+    left_out,
+    listed,
+    numbers,
+    shown,
+)
 from closerange.delivery.plots import Level, Panel, axis_panels, panel_grid
 from closerange.delivery.sheet import Block, Figure, Paragraph, Table, Terms
 from closerange.delivery.svg import AXIS_COLOURS
@@ -47,6 +55,9 @@ def single_point_blocks(check: Mapping[str, Any]) -> tuple[str, list[Block]]:
         text = "Deviations from the procedure: " + "; ".join(check["deviations"]) + "."
         blocks.append(Paragraph(text))
     blocks += left_out(check)
+    if check.get("not_measured"):
+        names = listed(" ".join(filter(None, item)) for item in check["not_measured"])
+        blocks.append(Paragraph(f"Actual positions without a usable reading: {names}.", "warn"))
     blocks.append(_position_rows(rows))
     return "Single-point test", blocks
 
@@ -64,9 +75,11 @@ def _judgements(check: Mapping[str, Any]) -> list[Block]:
         return [Paragraph("No limits were agreed, hence there is no decision.")]
     bad = frozenset(i for i, row in enumerate(rows) if row[-1] == DECISIONS["reject"])
     head = ("figure", "found", "limit", "guard band", "unit", "decision")
+    level = fixed(100 * float((check["limits"] or {}).get("confidence", 0.95)), 0)
     text = (
         "A figure is accepted if it stays below its limit by the guard band, rejected if it "
-        "exceeds it by the guard band, and undecided in between (ISO 14253-1, 95 %)."
+        f"exceeds it by the guard band, and undecided in between (ISO 14253-1, {level} %). Nothing "
+        "is accepted while a reading or an actual position is missing from the comparison."
     )
     table = Table(
         "Figures against their limits", head, rows, texts=frozenset({0, 4, 5}), marked=bad

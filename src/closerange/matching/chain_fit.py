@@ -142,8 +142,10 @@ def _spread(weight: FloatArray, chain: IntArray, known: BoolArray) -> FloatArray
     """
     reach = 10
     kernel = np.ones(2 * reach + 1)
-    summed = np.convolve(weight, kernel, mode="same")
-    filled = np.convolve(np.ones(len(weight)), kernel, mode="same")
+    # not mode "same", which returns the longer of the two: chains may be shorter than the kernel
+    middle = slice(reach, reach + len(weight))
+    summed = np.convolve(weight, kernel)[middle]
+    filled = np.convolve(np.ones(len(weight)), kernel)[middle]
     first = np.r_[True, chain[1:] != chain[:-1]]
     start = np.maximum.accumulate(np.where(first, np.arange(len(chain)), 0))
     length = np.bincount(chain)[chain]

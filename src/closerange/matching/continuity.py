@@ -27,7 +27,7 @@ NEIGHBOUR_PLACES = 4.0
 """Places on a chain of the other view that still are neighbours: an edge may be seen there up to
 four times as long."""
 
-NO_MATCH = 2.7
+NO_MATCH = 2.5
 """Cost of having no match: less than the limit of misfit, else chance would be preferred."""
 
 CHANGE = 1.5

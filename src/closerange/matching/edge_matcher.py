@@ -148,8 +148,10 @@ def _smoothed(
 ) -> _Smoothed:
     count = len(edges[0])
     rows = np.flatnonzero(side.choice.candidate >= 0)
+    if not rows.size:
+        return _Smoothed(*(np.full(count, np.nan) for _ in range(5)))
     chosen = side.candidates.select(side.choice.candidate[rows])
-    px_per_mm = float(np.median(chosen.px_per_mm)) if len(chosen) else 1.0
+    px_per_mm = float(np.median(chosen.px_per_mm))
     to_px = px_per_mm / chosen.px_per_mm
     pace, sine_first = _in_first_view(pencil, edges[0].tangent[rows], chosen, axis)
     along_first = pace / sine_first

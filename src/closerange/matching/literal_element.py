@@ -15,11 +15,11 @@ from closerange.rig.camera import Camera
 
 SHAPES = ("square", "disc", "cross")
 
-_NOWHERE = 10**6
-"""Stands for a pixel's place in view 2 that is none; no image is so long."""
+_COVERED = 65536
+"""Pixels of footprints that are looked up at once, which the cache holds."""
 
-_BITS = 2**24
-"""Bytes of unpacked blocks that are held at once."""
+_BITS = 2**19
+"""Bytes of unpacked blocks that are held at once: the cache holds half a megabyte."""
 
 
 def footprint(size_px: int, shape: str = "square") -> BoolArray:
@@ -133,6 +133,9 @@ class MappedElements:
         Number of blocks, and of different pixels of each element.
     lowest, highest : ndarray of int, shape (M, 2)
         Smallest and largest (row, column) from the candidate.
+    oversized : ndarray of bool, shape (M,)
+        Whether a pixel fell farther from the candidate than image 2 is long; such an element has
+        been emptied: it could not be compared.
     """
 
     word: Words
@@ -140,8 +143,9 @@ class MappedElements:
     across: NDArray[np.int32]
     blocks: IntArray
     pixels: IntArray
-    lowest: IntArray
-    highest: IntArray
+    lowest: NDArray[np.int32]
+    highest: NDArray[np.int32]
+    oversized: BoolArray
 
     @property
     def reach(self) -> int:
@@ -176,8 +180,8 @@ class EdgePixels:
         there = self.carried(np.column_stack([column, row]).astype(np.float64))
         # a pixel that cannot be carried is no part of any element
         known = all_finite(there, 1)
-        self._there = there[known].astype(np.float32)
-        self._number[row[known], column[known]] = np.arange(len(self._there), dtype=np.int32)
+        self._across, self._down = np.ascontiguousarray(there[known].T)
+        self._number[row[known], column[known]] = np.arange(len(self._down), dtype=np.int32)
 
     def carried(self, xy_px: FloatArray) -> FloatArray:
         """Return where pixels of view 1 lie in view 2 through the plane; NaN if nowhere."""
@@ -210,14 +214,31 @@ class EdgePixels:
             together are one. Pixels beyond the image do not exist.
         """
         point, number = self._covered(pixel, inside)
-        known = all_finite(centre_px, 1)
-        kept = known[point]
-        point, number = point[kept], number[kept]
-        centre = np.where(known[:, None], centre_px, 0.0).astype(np.float32)
-        away = self._there.take(number, axis=0) - centre.take(point, axis=0)
-        offset = np.rint(np.clip(away, -_NOWHERE, _NOWHERE)).astype(np.int32)[:, ::-1]
+        # rows and columns apart: NumPy is slow along an axis of two
+        away = [
+            side.take(number) - centre_px[:, axis].take(point)
+            for axis, side in ((1, self._down), (0, self._across))
+        ]
+        oversized = self._oversized(point, away, len(pixel))
+        kept = ~(oversized | ~all_finite(centre_px, 1))[point]
+        if not kept.all():
+            point, away = point[kept], [side[kept] for side in away]
+        offset = [np.rint(side).astype(np.int32) for side in away]
         lowest, highest = _extents(point, offset, len(pixel))
-        return _packed(point, offset - lowest[point], lowest, highest)
+        corner = [low.take(point) for low in lowest.T]
+        place = (offset[0] - corner[0], offset[1] - corner[1])
+        word, across = _packed(point, place, np.max(highest - lowest, axis=0, initial=0), len(pixel))
+        return _without_empty(word, across, (lowest, highest), oversized)
+
+    def _oversized(
+        self, point: NDArray[np.intp], away: list[FloatArray], count: int
+    ) -> BoolArray:
+        """Mark the elements with a pixel farther from the candidate than image 2 is long."""
+        longest = max(self._cameras[1].size_px)
+        oversized = np.zeros(count, np.bool_)
+        for side in away:
+            oversized[point[np.abs(side) > longest]] = True
+        return oversized
 
     def _covered(
         self, pixel: IntArray, inside: BoolArray
@@ -228,46 +249,57 @@ class EdgePixels:
         row, column = np.nonzero(inside)
         window = (row * padded.shape[1] + column).astype(np.int32)
         corner = (pixel[:, 1] * padded.shape[1] + pixel[:, 0]).astype(np.int32)
-        found = padded.ravel().take(corner[:, None] + window)
-        place = np.flatnonzero(found.ravel() >= 0)
-        return place // len(window), found.ravel()[place]
+        flat = padded.ravel()
+        point, number = [np.zeros(0, np.intp)], [np.zeros(0, np.int32)]
+        step = max(_COVERED // len(window), 1)
+        for first in range(0, len(corner), step):
+            found = flat.take(corner[first : first + step, None] + window).ravel()
+            place = np.flatnonzero(found >= 0)
+            point.append(first + place // len(window))
+            number.append(found[place])
+        return np.concatenate(point), np.concatenate(number)
 
 
 def _extents(
-    point: NDArray[np.intp], offset: NDArray[np.int32], count: int
-) -> tuple[IntArray, IntArray]:
-    """Return the smallest and the largest offset of each candidate; 0 without any."""
-    lowest, highest = np.zeros((count, 2), np.int64), np.zeros((count, 2), np.int64)
+    point: NDArray[np.intp], offset: list[NDArray[np.int32]], count: int
+) -> tuple[NDArray[np.int32], NDArray[np.int32]]:
+    """Return the smallest and the largest (row, column) of each element; 0 without any."""
+    lowest, highest = np.zeros((count, 2), np.int32), np.zeros((count, 2), np.int32)
     if len(point):
         start = np.flatnonzero(np.diff(point, prepend=-1))
-        lowest[point[start]] = np.minimum.reduceat(offset, start, axis=0)
-        highest[point[start]] = np.maximum.reduceat(offset, start, axis=0)
+        for axis, side in enumerate(offset):
+            lowest[point[start], axis] = np.minimum.reduceat(side, start)
+            highest[point[start], axis] = np.maximum.reduceat(side, start)
     return lowest, highest
 
 
 def _packed(
-    point: NDArray[np.intp], place: IntArray, lowest: IntArray, highest: IntArray
-) -> MappedElements:
-    """Pack pixels, counted from each element's own corner, by candidate."""
-    count = len(lowest)
-    down, across = ((highest - lowest).max(axis=0, initial=0) // SIDE + 1).tolist()
-    row, column = place[:, 0], place[:, 1]
-    block = (row // SIDE) * across + column // SIDE
-    bit = (row % SIDE) * SIDE + column % SIDE
+    point: NDArray[np.intp],
+    place: tuple[NDArray[np.int32], NDArray[np.int32]],
+    extent: NDArray[np.int32],
+    count: int,
+) -> tuple[Words, int]:
+    """Pack pixels, counted from each element's own corner; return the blocks in a row too."""
+    down, across = (extent // SIDE + 1).tolist()
+    row, column = place
+    block = (row >> 3) * np.int32(across) + (column >> 3)
+    bit = (block << 6) + ((row & 7) << 3) + (column & 7)
     word = np.zeros((count, down * across), np.uint64)
     piece = max(_BITS // (64 * down * across), 1)
     for first in range(0, count, piece):
         low, high = np.searchsorted(point, (first, first + piece))
         canvas = np.zeros((min(piece, count - first), down * across * 64), np.uint8)
-        canvas[point[low:high] - first, block[low:high] * 64 + bit[low:high]] = 1
+        inside = (point[low:high] - first) * canvas.shape[1] + bit[low:high]
+        canvas.ravel()[inside] = 1
         word[first : first + piece] = bits_to_words(canvas)
-    return _without_empty(word, across, lowest, highest)
+    return word, across
 
 
 def _without_empty(
-    word: Words, across: int, lowest: IntArray, highest: IntArray
+    word: Words, across: int, ends: tuple[NDArray[np.int32], NDArray[np.int32]], oversized: BoolArray
 ) -> MappedElements:
     """Keep the blocks that have pixels, moved to the front of each row."""
+    lowest, highest = ends
     point, block = np.nonzero(word)
     blocks = np.bincount(point, minlength=len(word))
     slot = np.arange(len(point)) - np.repeat(np.cumsum(blocks) - blocks, blocks)
@@ -278,4 +310,4 @@ def _without_empty(
     rows[point, slot] = lowest[point, 0] + SIDE * (block // across)
     columns[point, slot] = lowest[point, 1] + SIDE * (block % across)
     pixels = count_bits(kept).sum(axis=1, dtype=np.int64)
-    return MappedElements(kept, rows, columns, blocks, pixels, lowest, highest)
+    return MappedElements(kept, rows, columns, blocks, pixels, lowest, highest, oversized)

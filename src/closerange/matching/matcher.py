@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from typing import Any
@@ -124,6 +124,7 @@ def match_views(
     seeds_cov_px2: FloatArray | None = None,
     point: Sequence[str] | None = None,
     placement: str = "",
+    progress: Callable[[int, int], None] | None = None,
 ) -> Correspondences:
     """Find points of the first view in all others.
 
@@ -141,6 +142,8 @@ def match_views(
         Their names; numbers otherwise.
     placement : str, optional
         For the rows of the table.
+    progress : callable, optional
+        Called with (done, total) after each further view.
 
     Returns
     -------
@@ -174,6 +177,8 @@ def match_views(
         found = _pair(first, other, rest, volume, seeds, seed_cov)
         xy[:, column], cov[:, column], flags[:, column] = found.xy_px, found.cov_px2, found.flags
         mismatch = np.fmin(mismatch, found.mismatch)
+        if progress:
+            progress(column, len(views) - 1)
     return Correspondences.of(
         cameras=[view.camera.name for view in views],
         point=list(point) if point is not None else [f"e{row}" for row in range(count)],
@@ -202,6 +207,8 @@ def _pair(
     seed_cov: FloatArray,
 ) -> _Found:
     pencil = Pencil.of(first.camera, second.camera)
+    if not len(first.edges):
+        return _nothing(len(seeds))
     greys = (first.pixels.astype(np.float32), second.pixels.astype(np.float32))
     others = [(view.camera, view.edges) for view in rest]
     matches = match_edges(pencil, (first.edges, second.edges), greys, volume_mm, others)
@@ -220,12 +227,21 @@ def _pair(
     return _Found(xy_px, cov, np.where(near, matches.cost[edge], np.nan), flags)
 
 
+def _nothing(count: int) -> _Found:
+    """Return that none of the seeds lies on an edge."""
+    nan = np.full((count, 2, 2), np.nan)
+    flags = np.full(count, int(Flag.no_edge), dtype=np.int64)
+    return _Found(nan[:, 0], nan, nan[:, 0, 0], flags)
+
+
 def _nearest(edges: EdgePoints, seeds: FloatArray) -> tuple[BoolArray, IntArray]:
     """Return which seeds lie on an edge, and the edge point nearest to each."""
-    if not len(edges):
-        return np.zeros(len(seeds), dtype=bool), np.zeros(len(seeds), dtype=np.int64)
-    distance, edge = cKDTree(edges.xy_px).query(seeds)
-    return np.asarray(distance <= ON_EDGE_PX), np.asarray(edge, dtype=np.int64)
+    near, edge = np.zeros(len(seeds), dtype=bool), np.zeros(len(seeds), dtype=np.int64)
+    known = np.flatnonzero(all_finite(seeds, 1))
+    if len(edges) and known.size:
+        distance, edge[known] = cKDTree(edges.xy_px).query(seeds[known])
+        near[known] = distance <= ON_EDGE_PX
+    return near, edge
 
 
 def _match_cov(matches: EdgeMatches, edge: IntArray, seed_cov: FloatArray) -> FloatArray:

@@ -73,9 +73,9 @@ class SeedRays:
     def __len__(self) -> int:
         return len(self.xy_px)
 
-    def select(self, rows: ArrayLike) -> SeedRays:
+    def select(self, rows: ArrayLike | slice) -> SeedRays:
         """Keep or reorder rows."""
-        kept = np.arange(len(self))[np.asarray(rows)]
+        kept = np.arange(len(self))[rows if isinstance(rows, slice) else np.asarray(rows)]
         return SeedRays(
             self.first, self.second, self.axis, self.xy_px[kept], self.ray[kept], self.by_px[kept]
         )

@@ -83,8 +83,8 @@ def read_positions(path: Path | str) -> Positions:
     Returns
     -------
     Positions
-        Its rows. Where rows state different `dof`, as in tables joined by hand, the smallest counts:
-        regions then err on the large side.
+        Its rows. Where rows state different `dof`, as in tables joined by hand, the smallest
+        counts: regions then err on the large side.
 
     Raises
     ------

@@ -121,7 +121,8 @@ def solve_points(rig: Rig, xy_px: FloatArray, cov_px2: FloatArray, used: BoolArr
         view has no covariance are solved with equal weights, and their covariance is NaN.
     """
     start = triangulate_linear(rig, xy_px, used)
-    known = (positive_definite(cov_px2.reshape(-1, 2, 2)).reshape(used.shape) | ~used).all(axis=1)
+    stated = positive_definite(cov_px2.reshape(-1, 2, 2)).reshape(used.shape)
+    known = np.asarray((stated | ~used).all(axis=1))
     cov_px2 = np.where((known[:, None] & used)[..., None, None], cov_px2, np.eye(2))
     refined = refine(rig, start, xy_px, cov_px2, used)
     residual, jacobian = _views(rig, refined, xy_px, used)

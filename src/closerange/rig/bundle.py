@@ -18,7 +18,7 @@ from closerange.rig.fit import Fit, take_apart
 from closerange.rig.projector import left_jacobian
 from closerange.rig.view import whiten
 
-MAX_ITERATIONS = 100
+MAX_ITERATIONS = 200
 """A usual bundle needs ten steps from OpenCV's start."""
 
 

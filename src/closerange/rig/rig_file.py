@@ -2,9 +2,9 @@
 
 Rows of numbers stand on one line. Geometry (matrices, poses, lenses, volume) must be finite;
 estimates of uncertainty may be ``null``, which means NaN: not known; noise and covariance only
-of a rig that is marked untrustworthy, since nothing else could mark what it measures. Keys that the schema does
-not have are refused, since one that is not understood may change what the others mean; free
-notes have their place under ``report`` and ``provenance``.
+of a rig that is marked untrustworthy, since nothing else could mark what it measures. Keys that
+the schema does not have are refused, since one that is not understood may change what the others
+mean; free notes have their place under ``report`` and ``provenance``.
 """
 
 from __future__ import annotations

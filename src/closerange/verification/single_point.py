@@ -274,7 +274,8 @@ def _deviations(
         (np.isnan(notes.cycle_time_s), "the cycle time is unknown"),
         (
             bool(notes.cycle_time_includes),
-            f"the cycle time is not that from the command to the result: {notes.cycle_time_includes}",
+            "the cycle time is not that from the command to the result: "
+            + notes.cycle_time_includes,
         ),
         (
             not reference.any(),

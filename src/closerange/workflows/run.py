@@ -27,6 +27,7 @@ from closerange.position.positions import Positions
 from closerange.rig.rig import Rig
 from closerange.rig.rig_file import rig_to_document, write_rig
 from closerange.settings import Detection, Job, Settings, images_of, inside, read_settings
+from closerange.verification.judgement import Limits
 from closerange.verification.result_file import write_result
 from closerange.workflows.calibrate import calibrate
 from closerange.workflows.detect import detect, read_crops
@@ -47,6 +48,12 @@ JOB_OVERLAYS = 2
 """Pictures of each camera and job: enough to see what was measured, and how well it was seen."""
 
 
+CYCLE_TIME_INCLUDES = (
+    "the program's own time, mean of {} readings, from the images on disk to the position: reading "
+    "and decoding the files, detection, position; without exposure, transfer and the command"
+)
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class JobResult:
     """What one job of a project gave.
@@ -61,12 +68,16 @@ class JobResult:
         Measured positions.
     result : ControlCheck, AcceptanceReport, LengthCheck or None
         Comparison with the truth, if one was given.
+    cycle_time_s : float
+        The program's own time for one reading of all cameras, from the images on disk to the
+        position. Written into the results only where the project limits it.
     """
 
     name: str
     points: ImagePoints
     positions: Positions
     result: Result | None
+    cycle_time_s: float
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -159,7 +170,7 @@ def _measure_all(
     settings: Settings, folder: Path, announce: Announce | None
 ) -> tuple[RunResult, list[Overlay]]:
     said = announce or (lambda _what, _done, _total: None)
-    points = _detect_all(settings, settings.calibration, CALIBRATION, said)
+    points, _ = _detect_all(settings, settings.calibration, CALIBRATION, said)
     said("calibrating", 0, 1)
     start = time.perf_counter()
     calibration = settings.calibration
@@ -182,17 +193,38 @@ def _measure_all(
 
 
 def _run_job(settings: Settings, job: Job, rig: Rig, said: Announce) -> JobResult:
-    points = _detect_all(settings, job, job.name, said)
+    points, detection_s = _detect_all(settings, job, job.name, said)
+    start = time.perf_counter()
     positions = measure(rig, points)
+    readings = len(set(zip(points.placement, points.reading, strict=True)))
+    cycle_s = (detection_s + time.perf_counter() - start) / readings
     result: Result | None = None
     if job.verify is not None and job.truth is not None:
-        truth = inside(settings, job.truth)
-        result = verify(job.verify, positions, truth=truth, rig=rig)
-    return JobResult(job.name, points, positions, result)
+        timed = job.limits is not None and job.limits.cycle_time_s is not None
+        result = verify(
+            job.verify,
+            positions,
+            truth=inside(settings, job.truth),
+            rig=rig,
+            limits=_limits(job),
+            cycle_time_s=cycle_s if timed else None,
+            cycle_time_includes=CYCLE_TIME_INCLUDES.format(readings) if timed else "",
+        )
+    return JobResult(job.name, points, positions, result, cycle_s)
 
 
-def _detect_all(settings: Settings, detection: Detection, what: str, said: Announce) -> ImagePoints:
-    """Detect in the images of all cameras, after checking that they belong together."""
+def _limits(job: Job) -> Limits | None:
+    return None if job.limits is None else Limits.of(**job.limits.model_dump())
+
+
+def _detect_all(
+    settings: Settings, detection: Detection, what: str, said: Announce
+) -> tuple[ImagePoints, float]:
+    """Detect in the images of all cameras, after checking that they belong together.
+
+    The time in s is that of reading the images and finding the target; not of the checks, which a
+    whole folder needs and a single reading does not.
+    """
     paths = {name: images_of(settings, listed) for name, listed in detection.images.items()}
     sets = group_images(paths, pattern=detection.placement_pattern)
     if detection.times is not None and detection.time_tolerance_s is not None:
@@ -206,6 +238,7 @@ def _detect_all(settings: Settings, detection: Detection, what: str, said: Annou
     )
     total, before = sum(len(one.paths) for one in sets), 0
     found: ImagePoints | None = None
+    start = time.perf_counter()
     for camera in detection.images:
         images = [one.paths[camera] for one in sets]
         points = detect(
@@ -220,7 +253,7 @@ def _detect_all(settings: Settings, detection: Detection, what: str, said: Annou
         before += len(images)
         found = points if found is None else found + points
     assert found is not None  # noqa: S101  # group_images refuses an empty job
-    return found
+    return found, time.perf_counter() - start
 
 
 def _offset_progress(

@@ -31,6 +31,7 @@ def verify(
     rig: Rig | Path | str | None = None,
     limits: Limits | None = None,
     cycle_time_s: float | None = None,
+    cycle_time_includes: str = "",
 ) -> Result:
     """Compare measured positions with a known truth.
 
@@ -49,6 +50,8 @@ def verify(
         Permissible errors; with them `single-point` decides.
     cycle_time_s : float, optional
         Time from the command to the result, for `single-point`.
+    cycle_time_includes : str, optional
+        What was timed, if it is less than that.
 
     Returns
     -------
@@ -79,7 +82,13 @@ def verify(
     for hint in truth_hints(positions, control):
         warnings.warn(hint, CloseRangeWarning, stacklevel=2)
     if kind == "single-point":
-        return single_point_test(positions, control, limits=limits, cycle_time_s=cycle_time_s)
+        return single_point_test(
+            positions,
+            control,
+            limits=limits,
+            cycle_time_s=cycle_time_s,
+            cycle_time_includes=cycle_time_includes,
+        )
     return _control_check(positions, control, rig)
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -164,14 +165,17 @@ def measure(
     """Measure world positions of points that two or more cameras see."""
     from closerange.apps.cli.screens import positions_summary, positions_text
     from closerange.position.positions_table import write_positions
+    from closerange.position.suspicion import REMEDY, DoubtWarning
     from closerange.workflows.measure import measure as work
 
     check_outputs([output], [rig, *points, times])
     options.check_times(points, times, time_tolerance)
-    with Progress("measuring"):
+    with Progress("measuring"), warnings.catch_warnings():
+        warnings.simplefilter("ignore", DoubtWarning)  # said below, as the reason of exit code 1
         positions = work(rig, points)
         write_positions(positions, output)
     failure = None if (positions.flags == 0).any() else _all_flagged(len(positions), output)
+    failure = DataError(positions.doubt, remedy=REMEDY) if positions.doubt else failure
     text, summary = positions_text(positions, output), positions_summary(positions, output)
     return Outcome(text, summary, failure=failure)
 
@@ -204,7 +208,7 @@ def verify(
     _json: options.Json = False,
 ) -> Outcome:
     """Compare positions with a known truth."""
-    from closerange.apps.cli.screens import result_summary, result_text
+    from closerange.apps.cli.screens import result_failure, result_summary, result_text
     from closerange.files import write_text
     from closerange.verification.result_file import read_result, write_result
     from closerange.workflows.inputs import input_hashes, versions
@@ -223,7 +227,8 @@ def verify(
     keep(output)
     if report is not None:
         write_text(report, report_of_result(read_result(output)))
-    return Outcome(result_text(result, output, report), result_summary(result, output))
+    text, summary = result_text(result, output, report), result_summary(result, output)
+    return Outcome(text, summary, failure=result_failure(result))
 
 
 @app.command(epilog=epilog("run"))
@@ -283,9 +288,10 @@ def report(
 
 
 def _outcome_of_run(result: RunResult, text: str) -> Outcome:
-    from closerange.apps.cli.screens import run_summary
+    from closerange.apps.cli.screens import run_failure, run_summary
 
-    return Outcome(text, run_summary(result), notes=result.warnings)
+    failure = run_failure(result)
+    return Outcome(text, run_summary(result), notes=result.warnings, failure=failure)
 
 
 def _all_flagged(rows: int, output: Path) -> DataError:

@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from closerange.errors import DataError
 from closerange.features.image_points import ImagePoints
 from closerange.flags import Flag
 from closerange.geometry.arrays import FloatArray, IntArray
@@ -134,6 +135,7 @@ def result_summary(result: Result, output: Path | None) -> dict[str, Any]:
             "repeatability_ratio": result.prediction.repeatability_ratio.tolist(),
             "coverage": result.coverage.share,
             "decision": result.decision,
+            "reservations": list(result.reservations),
         }
     if isinstance(result, LengthCheck):
         return summary | {
@@ -141,6 +143,7 @@ def result_summary(result: Result, output: Path | None) -> dict[str, Any]:
             "lengths": int(result.used.sum()),
             "rms_mm": result.rms_mm,
             "max_mm": result.max_mm,
+            "reservations": list(result.reservations),
         }
     groups = {
         name: {
@@ -159,7 +162,8 @@ def run_text(result: RunResult) -> str:
     for job in result.jobs:
         measured = f"{int(job.positions.measured.sum())} of {len(job.positions)} positions measured"
         found = _result_lines(job.result) if job.result is not None else []
-        blocks.append(lines(("Job", f"{job.name}: {measured}"), *found))
+        cycle = f"{1000 * job.cycle_time_s:.0f} ms a reading, images on disk to position"
+        blocks.append(lines(("Job", f"{job.name}: {measured}"), *found, ("Cycle time", cycle)))
     blocks.append(lines(("Report", result.report)))
     return "\n".join(blocks)
 
@@ -198,6 +202,7 @@ def run_summary(result: RunResult) -> dict[str, Any]:
                 "name": job.name,
                 "positions": len(job.positions),
                 "measured": int(job.positions.measured.sum()),
+                "cycle_time_s": job.cycle_time_s,
                 "result": None if job.result is None else result_summary(job.result, None),
             }
             for job in result.jobs
@@ -206,6 +211,29 @@ def run_summary(result: RunResult) -> dict[str, Any]:
         "calibration_s": result.calibration_s,
         "report": str(result.report),
     }
+
+
+def run_failure(result: RunResult) -> DataError | None:
+    """Say which job cannot be relied upon, although its tables are written."""
+    for job in result.jobs:
+        hollow = job.result.hollow if job.result is not None else ""
+        if hollow or job.positions.doubt:
+            return DataError(
+                f"job {job.name!r}: {hollow or 'its points contradict the rig, see the warning'}",
+                remedy="look at its flags; the files are written to be looked at, not relied on",
+            )
+    return None
+
+
+def result_failure(result: Result) -> DataError | None:
+    """Say why a result that is written proves nothing."""
+    if not result.hollow:
+        return None
+    return DataError(
+        result.hollow,
+        remedy="look at the flags of the positions, and measure again; the result is written to be "
+        "looked at, not relied on",
+    )
 
 
 def micrometres(value_mm: float) -> str:
@@ -237,17 +265,24 @@ def _result_lines(result: Result) -> list[tuple[str, object]]:
         share = result.coverage.share
         region = f" (95 % region holds {100 * share:.1f} %)" if np.isfinite(share) else ""
         rows: list[tuple[str, object]] = [
-            ("Verified", f"{len(result.point)} positions not used before{region}"),
+            ("Verified", f"{len(result.point)} positions, {_readings(result)} each{region}"),
             ("Accuracy", f"{_axes(accuracy.max_mm)} worst, {_axes(accuracy.rms_mm)} rms"),
             ("Repeatable", f"{_axes(scatter)} standard deviation"),
         ]
         if result.decision:
             rows.append(("Decision", result.decision))
-        return rows
+        return [*rows, *(("Mind that", text) for text in result.reservations)]
     if isinstance(result, LengthCheck):
         rms, worst = micrometres(result.rms_mm), micrometres(result.max_mm)
-        return [("Lengths", f"{int(result.used.sum())}: rms {rms}, worst {worst}")]
+        found = [("Lengths", f"{int(result.used.sum())}: rms {rms}, worst {worst}")]
+        return [*found, *(("Mind that", text) for text in result.reservations)]
     return _control_lines(result)
+
+
+def _readings(result: AcceptanceReport) -> str:
+    low, high = int(result.count.min()), int(result.count.max())
+    count = f"{high}" if low == high else f"{low} to {high}"
+    return f"{count} reading{'' if high == 1 else 's'}"
 
 
 def _control_lines(result: ControlCheck) -> list[tuple[str, object]]:

@@ -1,0 +1,433 @@
+"""The thesis' matcher, literally: erosion of the neighbourhood by a structuring element.
+
+Chapter 5, sections 5.2 to 5.6: the edge pixels of N x N px around a point of image 1 are carried
+into view 2 through the plane farthest from the cameras and scanned over the epipolar segment; the
+place at which the fewest of them are missing from the edges of image 2 is the correspondence. A
+reference for comparison: `closerange.matching` has better matchers.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, fields
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from closerange.errors import InputError
+from closerange.features.edge_operators import edge_mask
+from closerange.features.threshold import threshold_report
+from closerange.flags import Flag
+from closerange.geometry.arrays import (
+    BoolArray,
+    FloatArray,
+    IntArray,
+    all_finite,
+    frozen_array,
+    frozen_ints,
+)
+from closerange.matching.correspondences import Correspondences
+from closerange.matching.literal_band import Bands, bands
+from closerange.matching.literal_element import (
+    EdgePixels,
+    MappedElements,
+    check_size,
+    farthest_plane,
+    footprint,
+)
+from closerange.matching.literal_scan import Chosen, Hits, PackedImage, choose_places
+from closerange.matching.search import checked_volume, inside_image
+from closerange.rig.camera import Camera
+
+Progress = Callable[[int, int], None]
+
+BAND_PX = 0.5
+"""Half-width of the band: the whole pixels nearest to the segment. The thesis draws a line."""
+
+_PIECE = 4096
+"""Points whose candidates are listed at once: 50 MB for segments of 500 px."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class LiteralMatches:
+    """Matches of N points.
+
+    Attributes
+    ----------
+    seed_px : ndarray, shape (N, 2)
+        Points of view 1.
+    xy_px : ndarray, shape (N, 2)
+        Matches in view 2, whole pixels; NaN without one.
+    mismatch : ndarray, shape (N,)
+        Pixels of the element that are missing in image 2; NaN without a match.
+    pixels : ndarray of int, shape (N,)
+        Pixels of the element in view 2.
+    ties : ndarray of int, shape (N,)
+        Places at which as few are missing, the chosen one included.
+    flags : ndarray of int, shape (N,)
+        `Flag` bits of each match. `ambiguous`: an equally good place is farther than a pixel's
+        neighbours. `at_border`: the element is cut by the border of either image. Without a
+        match: `no_edge` (the element has no pixel, or none of it is anywhere in the
+        neighbourhood), `outside_image` (the point, the segment or an oversized element),
+        `not_found` (no point), and those of `EpipolarSegments`.
+    """
+
+    seed_px: FloatArray
+    xy_px: FloatArray
+    mismatch: FloatArray
+    pixels: IntArray
+    ties: IntArray
+    flags: IntArray
+
+    def __post_init__(self) -> None:
+        count = len(self.flags)
+        for name in ("seed_px", "xy_px"):
+            object.__setattr__(self, name, frozen_array(getattr(self, name), (count, 2), name))
+        object.__setattr__(self, "mismatch", frozen_array(self.mismatch, (count,), "mismatch"))
+        for name in ("pixels", "ties", "flags"):
+            object.__setattr__(self, name, frozen_ints(getattr(self, name), (count,), name))
+
+    def __len__(self) -> int:
+        return len(self.flags)
+
+    def to_correspondences(
+        self, cameras: Sequence[str], point: Sequence[str], placement: str = ""
+    ) -> Correspondences:
+        """Return the matches as rows of a matches table.
+
+        Parameters
+        ----------
+        cameras : sequence of str
+            Names of view 1 and view 2.
+        point : sequence of str
+            Names of the N points.
+        placement : str, optional
+            Name of the placement.
+
+        Returns
+        -------
+        Correspondences
+            `mismatch` is the count; covariances are unknown: the method states none.
+        """
+        first, second = cameras
+        missing = ~all_finite(self.seed_px, 1)
+        seed_flags = np.where(missing, int(Flag.not_found), 0)
+        return Correspondences.of(
+            cameras=(first, second),
+            point=point,
+            placement=placement,
+            xy_px=np.stack([self.seed_px, self.xy_px], axis=1),
+            mismatch=self.mismatch,
+            flags=np.column_stack([seed_flags, self.flags]),
+        )
+
+
+def binary_images(
+    images: Sequence[NDArray[Any]], *, original: bool = False
+) -> tuple[BoolArray, BoolArray]:
+    """Threshold both images as section 5.3 does.
+
+    Parameters
+    ----------
+    images : sequence of two ndarrays, shape (H, W)
+        Grey images.
+    original : bool, optional
+        Threshold the images themselves, for objects that stand out from their background;
+        otherwise their blur-minimum edge strength.
+
+    Returns
+    -------
+    tuple of two ndarrays of bool, shape (H, W)
+        Pixels above Trussell's threshold (equation 5.1); none in a blank image.
+
+    Raises
+    ------
+    InputError
+        If an image has another form.
+    """
+    first, second = images
+    if original:
+        masks = (np.asarray(grey > threshold_report(grey).threshold) for grey in (first, second))
+    else:
+        masks = (edge_mask(grey)[0] for grey in (first, second))
+    one, two = masks
+    return one, two
+
+
+class LiteralMatcher:
+    """The literal matcher for one pair of images, for any number of points and elements.
+
+    Parameters
+    ----------
+    cameras : sequence of two Cameras
+        View 1, whose points are given, and view 2.
+    masks : sequence of two ndarrays of bool, shape (H, W)
+        See `binary_images`.
+    volume_mm : array_like, shape (2, 3)
+        Where the points may be in the world; see
+        `closerange.matching.search.between_planes`.
+    band_px : float, optional
+        Half-width of the band around the segment; see `closerange.matching.literal_band.bands`.
+
+    Raises
+    ------
+    InputError
+        If an image has another size than its camera, or the volume or the band is none.
+    """
+
+    def __init__(
+        self,
+        cameras: Sequence[Camera],
+        masks: Sequence[BoolArray],
+        volume_mm: ArrayLike,
+        *,
+        band_px: float = BAND_PX,
+    ) -> None:
+        first, second = cameras
+        for camera, mask in zip((first, second), masks, strict=True):
+            _check_size(camera, mask)
+        self.cameras = (first, second)
+        self.volume_mm = checked_volume(volume_mm)
+        self.band_px = band_px
+        self._image = PackedImage(np.asarray(masks[1], np.bool_))
+        plane = farthest_plane(first, second, self.volume_mm)
+        self._edges = EdgePixels(first, second, np.asarray(masks[0], np.bool_), plane)
+
+    def match(
+        self,
+        xy_px: ArrayLike,
+        inside: BoolArray,
+        *,
+        whole_image: bool = False,
+        progress: Callable[[int, int], None] | None = None,
+    ) -> LiteralMatches:
+        """Match points of view 1.
+
+        Parameters
+        ----------
+        xy_px : array_like, shape (N, 2)
+            Points; the element is cut around the nearest pixel.
+        inside : ndarray of bool, shape (S, S)
+            Footprint of the element; see `closerange.matching.literal_element.footprint`.
+        whole_image : bool, optional
+            Scan the whole image 2 instead of the segment, for comparison: it takes a thousand
+            times as long.
+        progress : callable, optional
+            Called with the number of points done and of all.
+
+        Returns
+        -------
+        LiteralMatches
+            N points.
+
+        Raises
+        ------
+        InputError
+            If the element is larger than image 1.
+        """
+        seeds = np.reshape(np.asarray(xy_px, np.float64), (-1, 2))
+        step = 1 if whole_image else _PIECE
+        found = []
+        for first in range(0, len(seeds), step):
+            piece = seeds[first : first + step]
+            found.append(self._piece(piece, inside, whole_image=whole_image))
+            if progress is not None:
+                progress(first + len(piece), len(seeds))
+        return _joined(found)
+
+    def bands(self, xy_px: FloatArray) -> Bands:
+        """Return the neighbourhoods of points, shape (M, 2)."""
+        return bands(self.cameras, xy_px, self.volume_mm, self.band_px)
+
+    def elements(self, xy_px: FloatArray, inside: BoolArray) -> MappedElements:
+        """Cut the elements around points, shape (M, 2), and carry them into view 2.
+
+        Parameters
+        ----------
+        xy_px : ndarray, shape (M, 2)
+            Points; an element is empty where there is none in the image.
+        inside : ndarray of bool, shape (S, S)
+            Footprint.
+
+        Returns
+        -------
+        MappedElements
+            M elements.
+
+        Raises
+        ------
+        InputError
+            If the element is larger than image 1.
+        """
+        first = self.cameras[0]
+        _check_footprint(first, inside)
+        usable = inside_image(first, xy_px)
+        seeds = np.where(usable[:, None], xy_px, np.nan)
+        pixel = np.rint(np.where(usable[:, None], xy_px, 0.0)).astype(np.int64)
+        pixel = np.clip(pixel, 0, np.array(first.size_px) - 1)
+        return self._edges.elements(pixel, self._edges.carried(seeds), inside)
+
+    def scan(self, elements: MappedElements, places: Bands) -> Hits:
+        """Count the pixels of elements that are present at each place; see `PackedImage.scan`."""
+        return self._image.scan(elements, places)
+
+    def _piece(
+        self, seeds: FloatArray, inside: BoolArray, *, whole_image: bool
+    ) -> LiteralMatches:
+        elements = self.elements(seeds, inside)
+        if whole_image:
+            places = _everywhere(self.cameras[1], inside_image(self.cameras[0], seeds))
+            hits = np.stack(
+                [self._image.scan_all(elements, row).ravel() for row in range(len(seeds))]
+            )
+        else:
+            places = self.bands(seeds)
+            hits = self.scan(elements, places)
+        return self._decided(seeds, inside, (elements, places), choose_places(hits, places))
+
+    def _decided(
+        self,
+        seeds: FloatArray,
+        inside: BoolArray,
+        searched: tuple[MappedElements, Bands],
+        chosen: Chosen,
+    ) -> LiteralMatches:
+        elements, places = searched
+        flags = places.flags.copy()
+        there = inside_image(self.cameras[0], seeds)
+        known = all_finite(seeds, 1)
+        flags[~known] = int(Flag.not_found)
+        flags[(known & ~there) | elements.oversized] |= int(Flag.outside_image)
+        barred = flags & ~int(Flag.near_parallel) != 0
+        flags[~barred & (chosen.hits == 0)] |= int(Flag.no_edge)
+        found = ~barred & (chosen.hits > 0)
+        rows = np.arange(len(seeds))
+        at = np.column_stack(
+            [places.column[rows, chosen.place], places.row[rows, chosen.place]]
+        )
+        flags[found & chosen.spread] |= int(Flag.ambiguous)
+        cut = _cut(self.cameras[0], np.rint(seeds), len(inside) // 2) | _sticks_out(
+            self.cameras[1], at, elements
+        )
+        flags[found & cut] |= int(Flag.at_border)
+        return LiteralMatches(
+            seed_px=seeds,
+            xy_px=np.where(found[:, None], at, np.nan),
+            mismatch=np.where(found, elements.pixels - chosen.hits, np.nan),
+            pixels=elements.pixels,
+            ties=np.where(found, chosen.ties, 0),
+            flags=flags,
+        )
+
+
+def _check_size(camera: Camera, mask: BoolArray) -> None:
+    width, height = camera.size_px
+    if mask.shape != (height, width):
+        found = "x".join(str(side) for side in mask.shape[::-1])
+        raise InputError(
+            f"the image of camera {camera.name!r} has {found} px, the camera {width}x{height}",
+            remedy="give whole images of the size that was calibrated",
+        )
+
+
+def _check_footprint(camera: Camera, inside: BoolArray) -> None:
+    if inside.ndim != 2 or inside.shape[0] != inside.shape[1] or not inside.any():
+        raise InputError(
+            f"an element of shape {inside.shape} with {np.count_nonzero(inside)} px",
+            remedy="give a square array with some pixels set",
+        )
+    check_size(len(inside))
+    if len(inside) > min(camera.size_px):
+        raise InputError(
+            f"an element of {len(inside)} px in an image of {min(camera.size_px)} px",
+            remedy="choose an element smaller than the parts",
+        )
+
+
+def _everywhere(camera: Camera, usable: BoolArray) -> Bands:
+    """Return the whole image as the neighbourhood, row by row."""
+    width, height = camera.size_px
+    shape = (len(usable), width * height)
+    place = np.arange(width * height, dtype=np.int32)
+    return Bands(
+        column=np.broadcast_to(place % width, shape),
+        row=np.broadcast_to(place // width, shape),
+        valid=np.broadcast_to(usable[:, None], shape),
+        flags=np.zeros(len(usable), np.int64),
+    )
+
+
+def _cut(camera: Camera, centre_px: FloatArray, reach: int) -> BoolArray:
+    """Tell which elements reach beyond the border of image 1."""
+    last = np.array(camera.size_px) - 1
+    with np.errstate(invalid="ignore"):
+        return np.asarray(((centre_px < reach) | (centre_px > last - reach)).any(axis=1))
+
+
+def _sticks_out(camera: Camera, at: IntArray, elements: MappedElements) -> BoolArray:
+    """Tell which elements, at their places, have pixels beyond the border of image 2."""
+    last = np.array(camera.size_px) - 1
+    lowest, highest = elements.lowest[:, ::-1] + at, elements.highest[:, ::-1] + at
+    return np.asarray(((lowest < 0) | (highest > last)).any(axis=1))
+
+
+def _joined(parts: Sequence[LiteralMatches]) -> LiteralMatches:
+    nothing = np.zeros(0)
+    none = LiteralMatches(np.zeros((0, 2)), np.zeros((0, 2)), nothing, nothing, nothing, nothing)
+    columns = (
+        np.concatenate([getattr(part, field.name) for part in (none, *parts)])
+        for field in fields(LiteralMatches)
+    )
+    return LiteralMatches(*columns)
+
+
+def match_literally(
+    images: Sequence[NDArray[Any]],
+    cameras: Sequence[Camera],
+    xy_px: ArrayLike,
+    volume_mm: ArrayLike,
+    *,
+    size_px: int = 15,
+    band_px: float = BAND_PX,
+    original: bool = False,
+    whole_image: bool = False,
+) -> LiteralMatches:
+    """Match points as chapter 5 of the thesis does, with its square element.
+
+    Parameters
+    ----------
+    images : sequence of two ndarrays, shape (H, W)
+        Grey images of view 1 and view 2.
+    cameras : sequence of two Cameras
+        In the same order.
+    xy_px : array_like, shape (N, 2)
+        Points of view 1.
+    volume_mm : array_like, shape (2, 3)
+        Where they may be; `closerange.matching.search.between_planes` gives the thesis' volume.
+    size_px : int, optional
+        N, odd: 15 for edge points, 59 for centroids in the thesis' images of 512 px, 150 mm.
+    band_px : float, optional
+        Half-width of the neighbourhood around the epipolar segment, 0.5 or more.
+    original : bool, optional
+        Threshold the images, not their edge strength; see `binary_images`.
+    whole_image : bool, optional
+        The whole image 2 as neighbourhood; see `LiteralMatcher.match`.
+
+    Returns
+    -------
+    LiteralMatches
+        N points.
+
+    Raises
+    ------
+    InputError
+        If an image has another size than its camera, or the element, the band or the volume is
+        none.
+    """
+    inside = footprint(size_px)
+    for camera, image in zip(cameras, images, strict=True):
+        _check_size(camera, image)
+    masks = binary_images(images, original=original)
+    matcher = LiteralMatcher(cameras, masks, volume_mm, band_px=band_px)
+    return matcher.match(xy_px, inside, whole_image=whole_image)

@@ -1,0 +1,161 @@
+"""The search neighbourhood as pixels: a band around the epipolar segment."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from closerange.errors import InputError
+from closerange.flags import Flag
+from closerange.geometry.arrays import BoolArray, FloatArray, IntArray
+from closerange.matching.search import EpipolarSegments, epipolar_segment
+from closerange.rig.camera import Camera
+
+WIDEST_PX = 1000.0
+"""Widest half-width: beyond it the whole image is the plainer neighbourhood."""
+
+_STEP_PX = 32.0
+"""Largest distance of samples of a segment, joined by straight lines: where a lens bends the
+segment with a radius of 4000 px (2.7 px over 300), it strays by 0.03 px between two."""
+
+_CHUNK = 32768
+"""Pixels that are listed at once: 256 kB a column of numbers, which the cache holds."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Bands:
+    """Pixels of view 2 in which each candidate is looked for; M points, at most L pixels each.
+
+    Attributes
+    ----------
+    column, row : ndarray, shape (M, L)
+        Pixels in view 2, from near to far along the ray; a pixel of the image also where `valid`
+        is False.
+    valid : ndarray of bool, shape (M, L)
+        Which of them belong to the neighbourhood.
+    flags : ndarray of int, shape (M,)
+        Why there are none: those of `EpipolarSegments`.
+    """
+
+    column: NDArray[np.int32]
+    row: NDArray[np.int32]
+    valid: BoolArray
+    flags: IntArray
+
+
+def bands(
+    cameras: tuple[Camera, Camera], xy_px: FloatArray, volume_mm: FloatArray, band_px: float
+) -> Bands:
+    """List the pixels around epipolar segments.
+
+    Parameters
+    ----------
+    cameras : tuple of Camera
+        View 1 and view 2.
+    xy_px : ndarray, shape (M, 2)
+        Observed px in view 1.
+    volume_mm : ndarray, shape (2, 3)
+        See `epipolar_segment`.
+    band_px : float
+        Half-width b. The segment is y = f(x) if it runs more along x than along y; the pixels of
+        a column x are those with f(x) - b <= y < f(x) + b, and likewise with x and y exchanged.
+        With 0.5, the smallest, there is one pixel a column. Columns reach from the rounded start
+        to the rounded end.
+
+    Returns
+    -------
+    Bands
+        For M points.
+
+    Raises
+    ------
+    InputError
+        If the half-width is below 0.5 or above 1000 px.
+    """
+    if not 0.5 <= band_px <= WIDEST_PX:
+        raise InputError(
+            f"a band of half-width {band_px} px",
+            remedy=f"give 0.5 to {WIDEST_PX:.0f} px: below, it would have gaps",
+        )
+    segments = epipolar_segment(*cameras, xy_px, volume_mm, step_px=_STEP_PX)
+    lines = _lines(segments)
+    per_column = int(np.ceil(2 * band_px))
+    shape = (len(segments), max(int(lines.columns.max(initial=0)), 1) * per_column)
+    column, row = np.zeros(shape, np.int32), np.zeros(shape, np.int32)
+    valid = np.zeros(shape, np.bool_)
+    step = max(_CHUNK // shape[1], 1)
+    for first in range(0, len(segments), step):
+        part = slice(first, first + step)
+        along, across, valid[part] = _pixels(lines, part, band_px, per_column)
+        upright = lines.upright[part, None]
+        column[part] = np.where(upright, across, along)
+        row[part] = np.where(upright, along, across)
+    width, height = cameras[1].size_px
+    valid &= (column >= 0) & (column < width) & (row >= 0) & (row < height)
+    np.clip(column, 0, width - 1, out=column)
+    np.clip(row, 0, height - 1, out=row)
+    return Bands(column, row, valid, lines.flags)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Lines:
+    """Segments as functions of the coordinate along which they run; M segments.
+
+    `way`, counted from the start, and `other` are the samples' coordinates, shape (M, K), the
+    last one repeated; `start` and `sign` turn ways into coordinates.
+    """
+
+    upright: BoolArray
+    start: FloatArray
+    sign: IntArray
+    columns: IntArray
+    way: FloatArray
+    other: FloatArray
+    flags: IntArray
+
+
+def _lines(segments: EpipolarSegments) -> _Lines:
+    """Choose the axis along which each segment runs."""
+    rows = np.arange(len(segments))
+    last = np.maximum(segments.count - 1, 0)
+    place = np.minimum(np.arange(segments.xy_px.shape[1]), last[:, None])
+    samples = np.nan_to_num(segments.xy_px[rows[:, None], place])
+    ends = samples[:, -1] - samples[:, 0]
+    upright = np.abs(ends[:, 1]) > np.abs(ends[:, 0])
+    major = np.where(upright[:, None], samples[..., 1], samples[..., 0])
+    other = np.where(upright[:, None], samples[..., 0], samples[..., 1])
+    start, length = major[:, 0], major[:, -1] - major[:, 0]
+    sign = np.where(length < 0, -1, 1)
+    way = sign[:, None] * (major - start[:, None])
+    # a curve that turns back is none that pixels can be listed along
+    turns = (np.diff(way, axis=1) < 0).any(axis=1)
+    flags = np.where(turns, segments.flags | int(Flag.not_converged), segments.flags)
+    columns = np.abs(np.rint(start + length) - np.rint(start)).astype(np.int64) + 1
+    columns[flags & ~int(Flag.near_parallel) != 0] = 0
+    return _Lines(upright, start, sign, columns, way, other, np.asarray(flags, np.int64))
+
+
+def _pixels(
+    lines: _Lines, part: slice, band_px: float, per_column: int
+) -> tuple[FloatArray, FloatArray, BoolArray]:
+    """Return both coordinates of some segments' pixels, and which exist."""
+    place = np.arange(max(int(lines.columns.max(initial=0)), 1))
+    start, sign, way = lines.start[part, None], lines.sign[part, None], lines.way[part]
+    along = np.rint(start) + sign * place
+    asked = np.clip(sign * (along - start), 0.0, way[:, -1:])
+    # one interpolation for all: each segment has its own stretch of the abscissa
+    stretch = 1.0 + float(way.max(initial=0.0))
+    shift = stretch * np.arange(len(way))[:, None]
+    middle = np.interp(
+        (asked + shift).ravel(), (way + shift).ravel(), lines.other[part].ravel()
+    ).reshape(asked.shape)
+    across = np.ceil(middle - band_px)
+    exists = place < lines.columns[part, None]
+    if per_column == 1:
+        return along, across, exists
+    wide = across[..., None] + np.arange(per_column)
+    inside = exists[..., None] & (wide < middle[..., None] + band_px)
+    along = np.repeat(along, per_column, axis=1)
+    return along, wide.reshape(along.shape), inside.reshape(along.shape)

@@ -1,0 +1,208 @@
+"""Where a textured window may lie in the other view: a sweep along its segment, coarse to fine."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from closerange.geometry.arrays import FloatArray, IntArray
+from closerange.matching.window_planes import SeedRays
+from closerange.matching.window_scores import scores
+
+KEPT = 8
+"""Places that are looked at more finely: the best of each shape, and the best others."""
+
+NEAR = 2
+"""Samples on each side of such a place that are tried on the next finer level: one of the coarser
+level."""
+
+WINDOWS = 400
+"""Windows that are compared for a seed on the coarsest level, about; more than that start on a
+coarser one. The same number is compared on each finer level."""
+
+COARSEST = 4
+"""Levels above the image itself: on the uppermost, eleven samples are 176 px wide."""
+
+APART_PX = 2.0
+"""Two places along the curve that are further apart are different answers."""
+
+TOGETHER = 3
+"""Levels, from the finest, whose likelihoods may be added."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Places:
+    """The best and the second-best place of N windows; columns of two in that order.
+
+    Attributes
+    ----------
+    omega : ndarray, shape (N, 2)
+        Inverse depths; NaN without one.
+    tilt : ndarray, shape (N, 2, 2)
+        Tangents of the surface's tilts.
+    shape : ndarray of int, shape (N,)
+        The shape of the structuring element that tells the two places apart best.
+    evidence : ndarray, shape (N,)
+        Logarithm of the likelihood ratio of the two places for that shape.
+    """
+
+    omega: FloatArray
+    tilt: FloatArray
+    shape: IntArray
+    evidence: FloatArray
+
+
+def pyramid(grey: NDArray[np.float32], levels: int) -> list[NDArray[np.float32]]:
+    """Return an image and so many halvings of it; pixel x of a level is pixel 2 x of the finer."""
+    images = [grey]
+    while len(images) <= levels:
+        images.append(cv2.pyrDown(images[-1]))
+    return images
+
+
+def start_level(samples: int, hypotheses: int, size_px: tuple[int, int]) -> int:
+    """Return the level on which whole segments are swept; at least the first.
+
+    Parameters
+    ----------
+    samples : int
+        Length of a long segment, px.
+    hypotheses : int
+        Tilts that are tried.
+    size_px : tuple of int
+        Of the smaller image.
+    """
+    level = 1
+    while level < COARSEST and samples * hypotheses > WINDOWS << level and min(size_px) >= 64 << level:
+        level += 1
+    return level
+
+
+def find_places(
+    rays: SeedRays,
+    omega: FloatArray,
+    images: tuple[list[NDArray[np.float32]], list[NDArray[np.float32]]],
+    tilts: FloatArray,
+) -> Places:
+    """Find the best and the second-best place of each window on its epipolar segment.
+
+    The structuring element is chosen for each point: of all shapes and sizes (a size being the
+    sum over some of the finest levels) the one whose best place is the most likely against its own
+    second-best. A window too small or too plain fits everywhere, one that straddles two surfaces
+    fits badly everywhere: both have little evidence, and no truth is needed to see it.
+
+    Parameters
+    ----------
+    rays : SeedRays
+        N seeds.
+    omega : ndarray, shape (N, K)
+        Inverse depths of samples a px apart along the segments; NaN after the last.
+    images : tuple of two lists of ndarrays
+        Pyramids of both views, with as many levels as are to be swept.
+    tilts : ndarray, shape (H, 2)
+        Hypotheses of the surface's tilt.
+
+    Returns
+    -------
+    Places
+        One row for each seed.
+    """
+    top = len(images[0]) - 1
+    first = omega[:, :: 1 << top]
+    likely, tilt = scores(rays, first, (images[0][top], images[1][top]), 1 << top, tilts)
+    column = _outstanding(likely)
+    rows = np.arange(len(rays))[:, None]
+    place = np.where(column >= 0, first[rows, column], np.nan)
+    hypothesis = tilt[rows, column]
+    levels = [np.where((column >= 0)[:, :, None], likely[rows, column], -np.inf)]
+    for level in range(top - 1, -1, -1):
+        pair = (images[0][level], images[1][level])
+        place, hypothesis, value = _refined(rays, place, pair, 1 << level, tilts)
+        levels.append(value)
+    return _decided(rays, place, tilts[hypothesis], levels[::-1][:TOGETHER])
+
+
+def _outstanding(likely: FloatArray) -> IntArray:
+    """Return the columns of up to `KEPT` places, shape (N, KEPT); -1 fills up."""
+    rows, width, shapes = likely.shape
+    total = likely.sum(axis=2)
+    padded = np.pad(total, ((0, 0), (1, 1)), constant_values=-np.inf)
+    peak = (total >= padded[:, :-2]) & (total > padded[:, 2:]) & np.isfinite(total)
+    order = np.argsort(np.where(peak, -total, np.inf), axis=1, kind="stable")[:, :KEPT]
+    ranked = np.where(np.take_along_axis(peak, order, axis=1), order, -1)
+    best = np.where(np.isfinite(likely).any(axis=1), likely.argmax(axis=1), -1)
+    # the best two of all shapes together, then the best of each shape, then the others
+    listed = np.concatenate([ranked[:, :2], best, ranked[:, 2:]], axis=1)
+    near = np.abs(listed[:, :, None] - listed[:, None, :]) <= 1
+    again = (near & np.tri(listed.shape[1], k=-1, dtype=bool)).any(axis=2)
+    listed = np.where(again, -1, listed)
+    order = np.argsort(listed < 0, axis=1, kind="stable")[:, :KEPT]
+    return np.asarray(np.take_along_axis(listed, order, axis=1))
+
+
+def _refined(
+    rays: SeedRays,
+    place: FloatArray,
+    images: tuple[NDArray[np.float32], NDArray[np.float32]],
+    scale: int,
+    tilts: FloatArray,
+) -> tuple[FloatArray, IntArray, FloatArray]:
+    """Look around places on a finer level; return places, tilts and the likelihood of shapes."""
+    rows, kept = place.shape
+    known = np.isfinite(place)
+    used = int(known.sum(axis=1).max(initial=1))
+    place, known = place[:, :used], known[:, :used]
+    point, column = np.nonzero(known)
+    step = np.full(place.shape, np.nan)
+    pace = rays.select(point).pace(place[known])
+    step[known] = scale / np.linalg.norm(pace, axis=1)
+    near = place[:, :, None] + step[:, :, None] * np.arange(-NEAR, NEAR + 1)
+    near = np.where(near > 0, near, place[:, :, None])
+    single = rays.select(point)
+    value, tilt = scores(single, near[point, column], images, scale, tilts)
+    total = value.sum(axis=2)
+    best = total.argmax(axis=1)
+    pick = np.arange(len(point))
+    place, hypothesis = place.copy(), np.zeros(place.shape, dtype=np.int64)
+    place[known] = near[point, column][pick, best]
+    hypothesis[known] = tilt[pick, best]
+    likely = np.full((*place.shape, value.shape[2]), -np.inf)
+    likely[known] = value.max(axis=1)
+    return place, hypothesis, likely
+
+
+def _decided(
+    rays: SeedRays, place: FloatArray, tilt: FloatArray, levels: list[FloatArray]
+) -> Places:
+    """Choose size and shape by the evidence, and with them the best two places."""
+    used = place.shape[1]
+    known = np.isfinite(place)
+    point, column = np.nonzero(known)
+    seen = np.full((*place.shape, 2), np.nan)
+    seen[known] = rays.second.project(rays.select(point).at(place[known]))
+    sums = np.cumsum([level[:, :used] for level in levels], axis=0)
+    sums = np.concatenate(list(sums), axis=2)  # (N, C, sizes x shapes)
+    best = sums.argmax(axis=1)
+    rows = np.arange(len(place))[:, None]
+    away = np.linalg.norm(seen[:, :, None, :] - seen[rows, best][:, None, :, :], axis=3) > APART_PX
+    others = np.where(away, sums, -np.inf)
+    second = others.argmax(axis=1)
+    last = np.take_along_axis(others, second[:, None], axis=1)[:, 0]
+    top = np.take_along_axis(sums, best[:, None], axis=1)[:, 0]
+    # a window that explains nothing is what any other place must be compared with
+    with np.errstate(invalid="ignore"):
+        evidence = top - np.maximum(last, 0.0)
+    evidence = np.where(np.isfinite(top), evidence, -np.inf)
+    chosen = evidence.argmax(axis=1)
+    row = np.arange(len(place))
+    pair = np.stack([best[row, chosen], second[row, chosen]], axis=1)
+    there = np.stack([np.isfinite(top[row, chosen]), np.isfinite(last[row, chosen])], axis=1)
+    return Places(
+        np.where(there, place[rows, pair], np.nan),
+        tilt[rows, pair],
+        chosen % levels[0].shape[2],
+        evidence[row, chosen],
+    )

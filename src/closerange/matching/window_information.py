@@ -1,0 +1,177 @@
+"""How large a structuring element must be: information along the epipolar curve against noise."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from closerange.features.grey_noise import WINDOW_PX, noise_curve
+from closerange.geometry.arrays import BoolArray, FloatArray, IntArray
+from closerange.geometry.interpolation import bilinear
+
+HALF_WIDTHS = (5, 7, 10, 14, 20, 28, 40)
+"""Half-widths, px, from which one is chosen for each point: the area doubles from one to the next.
+Fewer than 11 x 11 px leave nothing to judge the fit of five parameters by."""
+
+SIGMA_SHARE = 0.5
+"""Standard deviation of the Gaussian weights per half-width: at the rim a seventh is left."""
+
+ENOUGH_PX = 0.03
+"""Standard deviation along the epipolar curve that is asked of the information. Interpolation and
+surfaces that are not plane leave about as much, and both grow with the window."""
+
+CORE_SHARE = 0.125
+"""Share of a window's information that the half as wide window must hold: evenly spread texture
+has a quarter there. Less means a plain surface whose border comes into view."""
+
+SIDE_SHARE = 0.1
+"""Share of a window's information that each two opposite halves must hold: else it is one edge at
+its rim."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Information:
+    """Structure of an image at several scales and at N points.
+
+    Attributes
+    ----------
+    tensor : ndarray, shape (S, N, 3)
+        Sums over windows of the products of derivatives xx, xy, yy in units of the noise of the
+        grey values, px^-2; what the noise itself contributes is taken off.
+    """
+
+    tensor: FloatArray
+
+    @classmethod
+    def of(
+        cls, grey: NDArray[np.float32], xy_px: FloatArray, half_widths: tuple[int, ...]
+    ) -> Information:
+        """Measure around points.
+
+        Parameters
+        ----------
+        grey : ndarray of float32, shape (H, W)
+            Image.
+        xy_px : ndarray, shape (N, 2)
+            Points.
+        half_widths : tuple of int
+            S half-widths of windows with Gaussian weights, px.
+        """
+        noise = noise_map(grey)
+        slope = [cv2.Sobel(grey, cv2.CV_32F, *order, ksize=3, scale=1 / 8) / noise
+                 for order in ((1, 0), (0, 1))]
+        # of white noise with unit variance, Sobel's derivative keeps 12 / 64
+        own = 12 / 64
+        products = (slope[0] ** 2 - own, slope[0] * slope[1], slope[1] ** 2 - own)
+        tensor = np.empty((len(half_widths), len(xy_px), 3))
+        for part, product in enumerate(products):
+            for number, half_width in enumerate(half_widths):
+                tensor[number, :, part] = _window_sum(product, xy_px, SIGMA_SHARE * half_width)
+        return cls(tensor)
+
+    def along(self, direction: FloatArray) -> FloatArray:
+        """Return the information about a shift along directions in the image, shape (S, N).
+
+        The inverse of its root is the standard deviation, px, if nothing else is unknown.
+
+        Parameters
+        ----------
+        direction : ndarray, shape (N, 2)
+            Shift per px of what is asked for.
+        """
+        x, y = direction.T
+        xx, xy, yy = np.moveaxis(self.tensor, 2, 0)
+        return np.asarray(np.maximum(x * x * xx + 2 * x * y * xy + y * y * yy, 0.0))
+
+
+def noise_map(grey: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Return the standard deviation of the noise of every pixel, shape (H, W)."""
+    level = cv2.blur(grey, (WINDOW_PX, WINDOW_PX))
+    return noise_curve(grey, level).at(level).astype(np.float32)
+
+
+def chosen_sizes(information: FloatArray, half_widths: tuple[int, ...]) -> IntArray:
+    """Choose the size of the structuring element of each point.
+
+    The smallest that holds enough information along the epipolar curve: noise falls with the area
+    of a window, while the part of it that lies on another surface, and the surface's own curvature,
+    grow with it. The information must not come from the rim alone (`CORE_SHARE`), else the window
+    has only just met the border of a plain surface.
+
+    Parameters
+    ----------
+    information : ndarray, shape (S, N)
+        About the match along the epipolar curve, both images together.
+    half_widths : tuple of int
+        S half-widths, ascending.
+
+    Returns
+    -------
+    ndarray of int, shape (N,)
+        Number of the size; -1 where none holds enough texture.
+    """
+    enough = information >= ENOUGH_PX**-2
+    core = np.ones_like(enough)
+    for number, half_width in enumerate(half_widths):
+        inner = [k for k in range(number) if half_widths[k] <= half_width // 2]
+        if inner:
+            core[number] = information[inner[-1]] >= CORE_SHARE * information[number]
+    good = enough & core
+    return np.where(good.any(axis=0), good.argmax(axis=0), -1)
+
+
+def saturation(grey: NDArray[np.float32]) -> float:
+    """Return the grey value at which an image clips; infinite if it does not.
+
+    The largest value of an image is its full scale if it is that of a sensor of 8 to 16 bits.
+    """
+    largest = float(grey.max()) if grey.size else 0.0
+    scales = {float(2**bits - 1) for bits in (8, 10, 12, 14, 16)} | {
+        float((2**bits - 1) << (16 - bits)) for bits in (10, 12, 14)
+    }
+    return largest if largest in scales else np.inf
+
+
+def clipped_share(grey: NDArray[np.float32], xy_px: FloatArray, half_width: FloatArray) -> FloatArray:
+    """Return the share of pixels at full scale in the square around each point, shape (N,)."""
+    full = grey >= saturation(grey)
+    if not full.any():
+        return np.zeros(len(xy_px))
+    total = cv2.integral(full.astype(np.uint8))
+    height, width = grey.shape
+    low = np.rint(xy_px - half_width[:, None]).astype(np.int64)
+    high = np.rint(xy_px + half_width[:, None]).astype(np.int64) + 1
+    limit = np.array([width, height])
+    low, high = np.clip(low, 0, limit), np.clip(high, 0, limit)
+    inside = (
+        total[high[:, 1], high[:, 0]]
+        - total[low[:, 1], high[:, 0]]
+        - total[high[:, 1], low[:, 0]]
+        + total[low[:, 1], low[:, 0]]
+    )
+    return np.asarray(inside / np.maximum((high - low).prod(axis=1), 1))
+
+
+def _window_sum(product: NDArray[Any], xy_px: FloatArray, sigma: float) -> FloatArray:
+    """Sum under a Gaussian around each point; in a smaller image where the Gaussian is wide."""
+    step = max(int(sigma // 2), 1)
+    height, width = product.shape
+    if step > 1:
+        size = (max(width // step, 2), max(height // step, 2))
+        product = cv2.resize(product, size, interpolation=cv2.INTER_AREA)
+    ratio = np.array([product.shape[1] / width, product.shape[0] / height])
+    mean = cv2.GaussianBlur(
+        product, (0, 0), sigma * ratio[0], sigmaY=sigma * ratio[1], borderType=cv2.BORDER_REPLICATE
+    )
+    return np.asarray(2 * np.pi * sigma**2 * bilinear(mean, (xy_px + 0.5) * ratio - 0.5))
+
+
+def within(xy_px: FloatArray, size_px: tuple[int, int], margin: float) -> BoolArray:
+    """Mark points at least so far from the border of an image, shape (N,)."""
+    limit = np.array(size_px) - 1 - margin
+    with np.errstate(invalid="ignore"):
+        return np.asarray(((xy_px >= margin) & (xy_px <= limit)).all(axis=1))
