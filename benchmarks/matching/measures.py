@@ -97,11 +97,11 @@ def figures(scene: Scene, matches: Matches) -> Figures:
         occluded_kept=_share(hidden & final, hidden),
         height_median=_quantile(height, 0.5),
         height_p95=_quantile(height, 0.95),
-        height_right_p95=_quantile(height[good[final & visible]], 0.95),
+        height_right_p95=_quantile(height[good[final & visible][: len(height)]], 0.95),
         median_px=_quantile(kept_error, 0.5),
         wrong_faces=wrong_faces(scene.xy_px, wrong),
         cover_px=_cover_px(scene, matches, final & visible),
-        cover_mm=_mean(height < NORMAL_95 * height_std) if matches.cov_px2 is not None else np.nan,
+        cover_mm=np.nan if matches.cov_px2 is None else _mean(height < NORMAL_95 * height_std),
         surface_final=_stage(
             final, surface & (error < scene.right_px), surface, np.zeros_like(surface), error
         ),

@@ -27,6 +27,9 @@ END_MM = 0.5
 SAMPLES = 16
 """Samples per mm: 0.02 px apart at 3 px per mm."""
 
+CHAMFER_MM = 1.5
+"""Edges so near to each other in space bound a chamfer; farther ones only look near."""
+
 STEP_PX = 0.3
 """Samples are not farther apart in an image with up to 5 px per mm; nor does an edge reach
 farther beyond its last sample."""
@@ -87,7 +90,7 @@ class MeshEdges:
         distance_px : ndarray, shape (M,)
             From point to foot.
         rivals : list of ndarray, shape (K, 3)
-            Feet that would do as well: on edges within reach and aligned.
+            The foot and those that would do as well: on other edges within reach and aligned.
         """
         image = camera.project(self.xyz_mm)
         ahead = camera.project(self.xyz_mm + 0.1 * self.direction) - image
@@ -95,7 +98,7 @@ class MeshEdges:
         ahead /= np.linalg.norm(ahead, axis=1, keepdims=True)
         foot, away = np.full((len(xy_px), 3), np.nan), np.full(len(xy_px), np.inf)
         near = cKDTree(image).query_ball_point(xy_px, within_px + STEP_PX)
-        rivals: list[FloatArray] = []
+        rivals = [np.empty((0, 3))] * len(xy_px)
         for point, found in enumerate(near):
             rows = np.array(found, dtype=np.intp)
             if tangent is not None and len(rows):
@@ -103,14 +106,31 @@ class MeshEdges:
             # samples are a fraction of a pixel apart: slide along the edge to the foot itself
             way = np.sum((xy_px[point] - image[rows]) * ahead[rows], axis=1)
             rows, way = rows[np.abs(way) < STEP_PX], way[np.abs(way) < STEP_PX]
-            own = self.xyz_mm[rows] + (way / px_per_mm[rows])[:, None] * self.direction[rows]
-            rivals.append(own)
             if len(rows):
-                at = image[rows] + way[:, None] * ahead[rows]
-                distance = np.linalg.norm(at - xy_px[point], axis=1)
-                best = int(np.argmin(distance))
-                foot[point], away[point] = own[best], distance[best]
+                own = self.xyz_mm[rows] + (way / px_per_mm[rows])[:, None] * self.direction[rows]
+                off = xy_px[point] - image[rows] - way[:, None] * ahead[rows]
+                foot[point], away[point] = _between(own, off)
+                own = own[np.linalg.norm(own - foot[point], axis=1) > CHAMFER_MM]
+                rivals[point] = np.concatenate([foot[[point]], own])
         return foot, away, rivals
+
+
+def _between(feet: FloatArray, off_px: FloatArray) -> tuple[FloatArray, float]:
+    """Return the point seen at a pixel and its distance from the nearest edge.
+
+    Between the two edges of a chamfer it lies on the chamfer, which is flat: in proportion to the
+    distances of both feet. Otherwise it is the nearest foot.
+    """
+    distance = np.linalg.norm(off_px, axis=1)
+    best = int(np.argmin(distance))
+    near = feet[best]
+    opposite = off_px @ off_px[best] < 0
+    opposite &= np.linalg.norm(feet - near, axis=1) < CHAMFER_MM
+    if opposite.any():
+        other = int(np.flatnonzero(opposite)[np.argmin(distance[opposite])])
+        share = distance[best] / (distance[best] + distance[other])
+        near = near + share * (feet[other] - near)
+    return near, float(distance[best])
 
 
 def _neighbours(xyz: FloatArray, along: FloatArray, part: Table) -> list[tuple[int, int]]:

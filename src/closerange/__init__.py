@@ -8,9 +8,8 @@ Ten lines from images to positions::
     points += cr.detect("calibration/right", target="plate.toml", camera="right")
     rig = cr.calibrate(points, control="control.csv")
     print(rig.trust)
-    part = cr.detect("part_l.png", target="disc.toml", camera="left", placement="part")
-    part += cr.detect("part_r.png", target="disc.toml", camera="right", placement="part")
-    positions = cr.measure(rig, part)
+    matches = cr.match(rig, {"left": "part_l.png", "right": "part_r.png"}, edges=True)
+    positions = cr.measure(rig, matches)
     positions.to_csv("part.csv")
 
 The verbs are those of the command line. Names are loaded when first used, so that
@@ -41,6 +40,7 @@ if TYPE_CHECKING:
     from closerange.workflows.calibrate import calibrate
     from closerange.workflows.demo import demo
     from closerange.workflows.detect import detect
+    from closerange.workflows.match import match
     from closerange.workflows.measure import measure
     from closerange.workflows.report import report
     from closerange.workflows.run import run
@@ -58,6 +58,7 @@ _HOME = {
     "calibrate": "workflows.calibrate",
     "demo": "workflows.demo",
     "detect": "workflows.detect",
+    "match": "workflows.match",
     "measure": "workflows.measure",
     "read_control": "features.control",
     "read_points": "features.points_table",
@@ -84,6 +85,7 @@ __all__ = [
     "calibrate",
     "demo",
     "detect",
+    "match",
     "measure",
     "read_control",
     "read_points",

@@ -238,7 +238,7 @@ def test_consensus_has_no_part_for_far_points():
 @pytest.mark.parametrize("points", [27, 63])
 def test_a_mirrored_world_is_not_sorted_into_a_camera(scene, points):
     view = noisy_view(np.random.default_rng(20), points, scene)
-    with pytest.raises(GeometryError, match="mirrored camera|cannot tell"):
+    with pytest.raises(GeometryError, match=r"mirrored camera|cannot tell"):
         clean(replace(view, xyz_mm=view.xyz_mm * [1, 1, -1]))
 
 

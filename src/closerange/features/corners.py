@@ -26,20 +26,20 @@ FEWEST = 5
 """Edge points of an arm: fewer do not tell its direction to better than some degrees."""
 
 ALIGNED = (0.8, 0.9, 0.95)
-"""Least cosine between an edge and the way to the corner at each of three looks: the first knows the
-corner to some 3 px, which is 37 degrees for points 5 px away; at the last 18 degrees remain."""
+"""Least cosine between an edge and the way to the corner at each of three looks: the first knows
+the corner to some 3 px, which is 37 degrees for points 5 px away; at the last 18 degrees remain."""
 
 GAP_RAD = np.deg2rad(10.0)
 """Gap between the directions in which edge points lie, seen from the corner, that parts two arms:
 an arm without gaps of its own spans less from one point to the next."""
 
 TURN_RAD = np.deg2rad(40.0)
-"""Least angle by which an edge turns at a corner. Where it turns by less, it may be a circle of 18 px
-radius or more; the arms of a smaller one are not straight."""
+"""Least angle by which an edge turns at a corner. Where it turns by less, it may be a circle of
+18 px radius or more; the arms of a smaller one are not straight."""
 
 MOVED_PX = 4.0
-"""A corner farther than this from where the image turns most belongs to other edges: that place lies
-inside of the corner, by up to half of the window plus the blur."""
+"""A corner farther than this from where the image turns most belongs to other edges: that place
+lies inside of the corner, by up to half of the window plus the blur."""
 
 DISTINCT_PX = 2.5
 """Corners nearer to each other than this are one."""
@@ -48,7 +48,7 @@ MISSED = 3.0
 """Standard deviations by which the arms of a corner may miss it."""
 
 PEAK_PX = 5
-"""Side of the window over which the structure of a corner is summed; see `cv2.cornerMinEigenVal`."""
+"""Side of the window over which the structure of a corner is summed."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -122,8 +122,10 @@ def find_corners(pixels: NDArray[Any], edges: EdgePoints) -> Corners:
         By rows of the image, from top to bottom. A junction at which one edge passes in front of
         another is found too; only a second view can tell.
     """
+    if not len(edges):
+        return _collected(edges, [])
     starts = _starts(pixels, edges)
-    tree = cKDTree(edges.xy_px) if len(edges) else None
+    tree = cKDTree(edges.xy_px)
     chain = chain_numbers(edges.after)
     found: list[tuple[FloatArray, FloatArray, list[_Arm]]] = []
     for start in starts:
@@ -137,8 +139,6 @@ def find_corners(pixels: NDArray[Any], edges: EdgePoints) -> Corners:
 
 def _starts(pixels: NDArray[Any], edges: EdgePoints) -> FloatArray:
     """Return the pixels, beside edges, where the image turns more than at their neighbours."""
-    if not len(edges):
-        return np.zeros((0, 2))
     smooth = cv2.GaussianBlur(np.asarray(pixels, dtype=np.float32), (0, 0), 0.7)
     turning = cv2.cornerMinEigenVal(smooth, PEAK_PX, ksize=3)
     beside = np.zeros(turning.shape, dtype=np.uint8)
@@ -154,14 +154,11 @@ def _corner(
     edges: EdgePoints, chain: IntArray, near: IntArray, start: FloatArray
 ) -> tuple[FloatArray, FloatArray, list[_Arm]] | None:
     """Return place, covariance and arms of the corner at a place; None if there is none."""
-    place, arms, cov = start, [], np.eye(2)
+    meeting: tuple[FloatArray, FloatArray, list[_Arm]] | None = (start, np.eye(2), [])
     for aligned in ALIGNED:
-        arms = _arms(edges, chain[near], near, place, aligned)
-        meeting = _meeting(arms)
-        if meeting is None:
-            return None
-        place, cov, arms = meeting
-    return place, cov, arms
+        if meeting is not None:
+            meeting = _meeting(_arms(edges, chain[near], near, meeting[0], aligned))
+    return meeting
 
 
 def _meeting(arms: list[_Arm]) -> tuple[FloatArray, FloatArray, list[_Arm]] | None:

@@ -1,4 +1,4 @@
-"""Corners of one view found in all others: where the matched edges that meet there meet in space."""
+"""Corners of one view found in all others: where the edges that meet there meet in space."""
 
 from __future__ import annotations
 
@@ -147,9 +147,7 @@ def _heights(pencil: Pencil, corners: Corners, matches: EdgeMatches, axis: int) 
             if len(rows) >= FEWEST:
                 on_arm = corners.point[rows]
                 fits.append(
-                    _at_corner(
-                        corners.along_px[rows], matches.xyz_mm[on_arm, axis], std_mm[on_arm]
-                    )
+                    _at_corner(corners.along_px[rows], matches.xyz_mm[on_arm, axis], std_mm[on_arm])
                 )
         if not fits:
             flags[number] = np.bitwise_or.reduce(matches.flags[point]) or int(Flag.no_edge)

@@ -45,8 +45,8 @@ Progress = Callable[[int, int], None]
 BAND_PX = 0.5
 """Half-width of the band: the whole pixels nearest to the segment. The thesis draws a line."""
 
-_PIECE = 4096
-"""Points whose candidates are listed at once: 50 MB for segments of 500 px."""
+_PIECE = 8192
+"""Points whose places are listed at once: 60 MB for segments of 500 px."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)

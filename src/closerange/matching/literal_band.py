@@ -86,16 +86,14 @@ def bands(
     column, row = np.zeros(shape, np.int32), np.zeros(shape, np.int32)
     valid = np.zeros(shape, np.bool_)
     step = max(_CHUNK // shape[1], 1)
+    width, height = cameras[1].size_px
     for first in range(0, len(segments), step):
         part = slice(first, first + step)
-        along, across, valid[part] = _pixels(lines, part, band_px, per_column)
+        along, across, exists = _pixels(lines, part, band_px, per_column)
         upright = lines.upright[part, None]
-        column[part] = np.where(upright, across, along)
-        row[part] = np.where(upright, along, across)
-    width, height = cameras[1].size_px
-    valid &= (column >= 0) & (column < width) & (row >= 0) & (row < height)
-    np.clip(column, 0, width - 1, out=column)
-    np.clip(row, 0, height - 1, out=row)
+        x, y = np.where(upright, across, along), np.where(upright, along, across)
+        column[part], row[part] = np.clip(x, 0, width - 1), np.clip(y, 0, height - 1)
+        valid[part] = exists & (column[part] == x) & (row[part] == y)
     return Bands(column, row, valid, lines.flags)
 
 

@@ -153,9 +153,10 @@ def _check_cameras(rig: Rig, points: ImagePoints) -> None:
 
 
 def _check_inside(points: ImagePoints, size_px: tuple[int, int]) -> None:
-    """Refuse points that cannot come from images of this size."""
+    """Refuse points that cannot come from images of this size, unless they say so themselves."""
     xy = points.xy_px
-    outside = points.found & ((xy < -0.5) | (xy > np.array(size_px) - 0.5)).any(axis=1)
+    admitted = (points.flags & int(Flag.outside_image)) != 0
+    outside = points.found & ~admitted & ((xy < -0.5) | (xy > np.array(size_px) - 0.5)).any(axis=1)
     if outside.any():
         row = int(np.flatnonzero(outside)[0])
         raise InputError(

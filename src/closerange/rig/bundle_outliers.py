@@ -49,15 +49,15 @@ def fit_bundle_without_blunders(
     square = np.sum(fit.whitened**2, axis=1)
     if fit.chi_square > HIDDEN**2 * fit.dof * inner_variance(square, fit.dof):
         kept = _sorted_robustly(seen, start)
+        fit = fit_bundle(seen.select(kept), start)
     tried: set[bytes] = set()
     for _ in range(EXCHANGES):
-        if not kept.all():
-            fit = fit_bundle(seen.select(kept), fit.bundle)
         changed = _changed(seen, fit, kept, image, trials)
         if (changed == kept).all() or changed.tobytes() in tried:
             break
         tried.add(kept.tobytes())
         kept = changed
+        fit = fit_bundle(seen.select(kept), fit.bundle)
     return fit, kept
 
 

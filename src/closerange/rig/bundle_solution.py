@@ -16,7 +16,14 @@ from closerange.rig.models import Model
 from closerange.rig.observations import Observations, listed, without_disc_bias
 from closerange.rig.outliers import MAX_SHARE, ROUNDING_PX
 from closerange.rig.solution import ROUNDS, SETTLED
-from closerange.rig.weights import Stated, common_variance, pull_of, shared_errors, whitener_of
+from closerange.rig.weights import (
+    Stated,
+    common_variance,
+    image_errors,
+    pull_of,
+    shared_errors,
+    whitener_of,
+)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -72,10 +79,10 @@ class BundleSolution:
         Usable rows with their weights.
     used : ndarray of bool, shape (n,)
         Usable rows that took part.
+    stated : Stated
+        What was known of the usable rows.
     tau_px : float
         Common part of the points' standard deviation.
-    weighted : bool
-        Whether residuals were weighed by covariances.
     """
 
     fit: BundleFit
@@ -83,8 +90,13 @@ class BundleSolution:
     xy_px: FloatArray
     seen: Sightings
     used: BoolArray
+    stated: Stated
     tau_px: float
-    weighted: bool
+
+    @property
+    def weighted(self) -> bool:
+        """Whether residuals were weighed by covariances."""
+        return self.stated.any
 
     @property
     def kept(self) -> BoolArray:
@@ -104,17 +116,18 @@ class BundleSolution:
         A point's error on the target goes with it into all placements and images, see
         `weights.parameter_covariance`.
         """
-        fit, observations = self.fit, self.placed.observations
-        total = (1.0 if self.weighted else self.noise_px**2) * fit.cofactor
-        std = observations.std_mm[self.kept]
+        fit, bundle = self.fit, self.fit.bundle
+        std = self.stated.std_mm[self.used]
         if std.any():
-            seen, bundle = self.seen.select(self.used), fit.bundle
+            seen, rows = self.seen.select(self.used), self.stated.control_row[self.used]
             turns = np.stack([pose.rotation for pose in bundle.poses])[seen.placement]
-            pull = pull_of(fit, seen.whitener, bundle.by_world(seen) @ turns)
-            total = total + shared_errors(
-                pull * std[:, None, None], observations.control_row[self.kept]
-            )
-        count = fit.bundle.camera_count
+            by_point = bundle.by_world(seen) @ turns * std[:, None, None]
+            cov = self.stated.cov_px2[self.used]
+            total = image_errors(fit, seen.whitener, cov, self.tau_px)
+            total = total + shared_errors(pull_of(fit, seen.whitener, by_point), rows)
+        else:
+            total = (1.0 if self.weighted else self.noise_px**2) * fit.cofactor
+        count = bundle.camera_count
         symmetric: FloatArray = 0.5 * (total + total.T)[:count, :count]
         return symmetric
 
@@ -209,7 +222,7 @@ def _settle(placed: Placed, xy_px: FloatArray, start: Bundle) -> BundleSolution:
         if not stated.any or (last >= 0 and abs(tau2 - last) <= SETTLED * last):
             break
         seen = seen.weighted(whitener_of(total + max(tau2, ROUNDING_PX**2) * np.eye(2)))
-    return BundleSolution(fit, placed, xy_px, seen, used, float(np.sqrt(tau2)), stated.any)
+    return BundleSolution(fit, placed, xy_px, seen, used, stated, float(np.sqrt(tau2)))
 
 
 def _stated(observations: Observations) -> Stated:

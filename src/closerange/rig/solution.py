@@ -111,7 +111,9 @@ class Solution:
     def covariance(self) -> FloatArray:
         """Return the covariance of all free parameters, camera by camera, shape (P, P)."""
         variance = 1.0 if self.weighted else self.noise_px**2
-        return parameter_covariance(self.fits, self.views, self.stated, variance)
+        return parameter_covariance(
+            self.fits, self.views, self.stated, variance=variance, tau_px=self.tau_px
+        )
 
 
 def solve(

@@ -19,6 +19,9 @@ from closerange.rig.camera_fit import CameraFit
 from closerange.rig.fit import Fit
 from closerange.rig.view import View, whiten
 
+ROUNDING_PX = 1e-6
+"""Errors below this are rounding of exact data."""
+
 _HALVINGS = 60  # float64 has 52 binary digits
 
 
@@ -110,7 +113,12 @@ def whitener_of(cov_px2: FloatArray) -> FloatArray:
 
 
 def parameter_covariance(
-    fits: Sequence[CameraFit], views: Sequence[View], stated: Sequence[Stated], variance: float
+    fits: Sequence[CameraFit],
+    views: Sequence[View],
+    stated: Sequence[Stated],
+    *,
+    variance: float,
+    tau_px: float,
 ) -> FloatArray:
     """Return the covariance of all cameras' parameters.
 
@@ -124,6 +132,8 @@ def parameter_covariance(
         What was known of them.
     variance : float
         Of whitened residuals: 1 where they are true standard deviations, else s^2.
+    tau_px : float
+        The common part.
 
     Returns
     -------
@@ -134,23 +144,45 @@ def parameter_covariance(
     """
     offsets = np.cumsum([0, *(len(fit.free) for fit in fits)])
     total = np.zeros((offsets[-1], offsets[-1]))
-    for fit, start in zip(fits, offsets, strict=False):
+    shared = any(part.std_mm.any() for part in stated)
+    count = sum(len(view) for view in views) if shared else 0
+    pull, done = np.zeros((count, offsets[-1], 3)), 0
+    for fit, view, part, start in zip(fits, views, stated, offsets, strict=False):
         block = slice(start, start + len(fit.free))
-        total[block, block] = variance * fit.cofactor
-    if not any(part.std_mm.any() for part in stated):
-        return total
-    rows = np.concatenate([part.control_row for part in stated])
-    std = np.concatenate([part.std_mm for part in stated])
-    pull = np.zeros((len(rows), offsets[-1], 3))
-    done = 0
-    for fit, view, start in zip(fits, views, offsets, strict=False):
-        pull[done : done + len(view), start : start + len(fit.free)] = _pull(fit, view)
+        if not shared:
+            total[block, block] = variance * fit.cofactor
+            continue
+        total[block, block] = image_errors(fit, view.whitener, part.cov_px2, tau_px)
+        by_point = fit.camera.project_jacobian(view.xyz_mm) * part.std_mm[:, None, None]
+        pull[done : done + len(view), block] = pull_of(fit, view.whitener, by_point)
         done += len(view)
-    return total + shared_errors(pull * std[:, None, None], rows)
+    if shared:
+        total += shared_errors(pull, np.concatenate([part.control_row for part in stated]))
+    return total
+
+
+def image_errors(
+    fit: Fit, whitener: FloatArray | None, cov_px2: FloatArray, tau_px: float
+) -> FloatArray:
+    """Return the covariance of parameters by the points' own errors in the image, (p, p).
+
+    Parameters
+    ----------
+    fit, whitener
+        Of N points.
+    cov_px2 : ndarray, shape (N, 2, 2)
+        Their covariances, without those of the control positions.
+    tau_px : float
+        Common part of their standard deviation.
+    """
+    lower = np.linalg.cholesky(cov_px2 + max(tau_px, ROUNDING_PX) ** 2 * np.eye(2))
+    columns = np.moveaxis(pull_of(fit, whitener, lower), 1, 0).reshape(len(fit.root), -1)
+    matrix: FloatArray = columns @ columns.T
+    return matrix
 
 
 def shared_errors(pull: FloatArray, control_row: IntArray) -> FloatArray:
-    """Return what it adds to the parameters' covariance that points share a control position.
+    """Return the covariance of parameters by errors of control positions, shape (P, P).
 
     Parameters
     ----------
@@ -159,23 +191,12 @@ def shared_errors(pull: FloatArray, control_row: IntArray) -> FloatArray:
         through that point alone.
     control_row : ndarray of int, shape (N,)
         Which points share a position.
-
-    Returns
-    -------
-    ndarray, shape (P, P)
-        To be added to a covariance in which each point erred on its own.
     """
     _, group = np.unique(control_row, return_inverse=True)
     together = np.zeros((group.max() + 1, *pull.shape[1:]))
     np.add.at(together, group, pull)
     shared: FloatArray = np.tensordot(together, together, axes=([0, 2], [0, 2]))
-    # each point's own share is in the cofactor already
-    return shared - np.tensordot(pull, pull, axes=([0, 2], [0, 2]))
-
-
-def _pull(fit: CameraFit, view: View) -> FloatArray:
-    """D parameters / d control mm of each point, shape (N, p, 3)."""
-    return pull_of(fit, view.whitener, fit.camera.project_jacobian(view.xyz_mm))
+    return shared
 
 
 def pull_of(fit: Fit, whitener: FloatArray | None, by_point: FloatArray) -> FloatArray:
@@ -187,15 +208,15 @@ def pull_of(fit: Fit, whitener: FloatArray | None, by_point: FloatArray) -> Floa
         Of N points.
     whitener : ndarray, shape (N, 3), or None
         Its weights.
-    by_point : ndarray, shape (N, 2, 3)
-        D px / d mm of each point.
+    by_point : ndarray, shape (N, 2, k)
+        Displacements in px by k causes.
 
     Returns
     -------
-    ndarray, shape (N, P, 3)
-        D parameters / d mm.
+    ndarray, shape (N, P, k)
+        Changes of the parameters.
     """
-    columns = np.moveaxis(by_point, 0, 2).swapaxes(0, 1)  # (3, 2, N)
+    columns = np.moveaxis(by_point, 0, 2).swapaxes(0, 1)  # (k, 2, N)
     _, white = whiten(whitener, np.zeros((2, len(by_point))), columns)
     moment = np.einsum("nip,kin->npk", fit.orthonormal, white)
     pull: FloatArray = np.einsum("qp,npk->nqk", fit.root, moment)

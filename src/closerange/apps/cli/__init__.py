@@ -1,8 +1,10 @@
 """The command line: parses, calls a workflow, prints; nothing else."""
 
-from closerange.apps.cli import shapes
+from closerange.apps.cli import match, shapes
 from closerange.apps.cli.commands import app
+from closerange.apps.cli.examples import epilog
 
+app.command(epilog=epilog("match"))(match.match)
 app.add_typer(shapes.app)
 
 

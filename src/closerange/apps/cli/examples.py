@@ -13,6 +13,12 @@ EXAMPLES = {
         "--control closerange-demo/inputs/control.csv",
         "--image-size left=640x512 --image-size right=640x512 -o rig.json",
     ),
+    "match": (
+        "closerange match closerange-demo/rig.json",
+        "left=closerange-demo/inputs/calibration/left_z+00.0.png",
+        "right=closerange-demo/inputs/calibration/right_z+00.0.png",
+        "--edges -o matches.csv",
+    ),
     "measure": (
         "closerange measure closerange-demo/rig.json",
         "closerange-demo/single-point-points.csv -o positions.csv",

@@ -34,7 +34,7 @@ def points_text(points: ImagePoints, output: Path) -> str:
     placements = len(set(zip(points.placement, points.reading, strict=True)))
     return lines(
         ("Points", f"{int(points.found.sum())} of {len(points)} found in {placements} images"),
-        ("Flags", _flags_text(points.flags)),
+        ("Flags", flags_text(points.flags)),
         ("Written", output),
     )
 
@@ -45,7 +45,7 @@ def points_summary(points: ImagePoints, output: Path) -> dict[str, Any]:
         "rows": len(points),
         "found": int(points.found.sum()),
         "unflagged": int((points.flags == 0).sum()),
-        "flags": _flag_counts(points.flags),
+        "flags": flag_counts(points.flags),
         "image_size": {name: list(size) for name, size in points.size_px.items()},
         "output": str(output),
     }
@@ -98,7 +98,7 @@ def positions_text(positions: Positions, output: Path) -> str:
     return lines(
         ("Positions", f"{int(measured.sum())} of {len(positions)} measured"),
         ("Std", f"{typical} (median)" if typical else ""),
-        ("Flags", _flags_text(positions.flags)),
+        ("Flags", flags_text(positions.flags)),
         ("Written", output),
     )
 
@@ -110,7 +110,7 @@ def positions_summary(positions: Positions, output: Path) -> dict[str, Any]:
         "rows": len(positions),
         "measured": int(measured.sum()),
         "unflagged": int((positions.flags == 0).sum()),
-        "flags": _flag_counts(positions.flags),
+        "flags": flag_counts(positions.flags),
         "residual_px_rms": _rms(positions.residual_px[measured]),
         "output": str(output),
     }
@@ -298,13 +298,15 @@ def _axes(values_mm: FloatArray) -> str:
     return " / ".join(micrometres(value).removesuffix(" um") for value in values_mm[:3]) + " um"
 
 
-def _flag_counts(flags: IntArray) -> dict[str, int]:
+def flag_counts(flags: IntArray) -> dict[str, int]:
+    """Count the rows that carry each flag."""
     counts = Counter(str(bit.name) for flag in flags for bit in Flag if bit in Flag(int(flag)))
     return dict(sorted(counts.items()))
 
 
-def _flags_text(flags: IntArray) -> str:
-    return ", ".join(f"{count} {name}" for name, count in _flag_counts(flags).items())
+def flags_text(flags: IntArray) -> str:
+    """Say how many rows carry each flag."""
+    return ", ".join(f"{count} {name}" for name, count in flag_counts(flags).items())
 
 
 def _outliers(rig: Rig) -> list[str]:

@@ -1,0 +1,178 @@
+"""The verb `match`."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from closerange.apps.cli import options
+from closerange.apps.cli.console import Outcome, keep, verb
+from closerange.apps.cli.outputs import check_outputs
+from closerange.apps.cli.progress import Progress
+from closerange.errors import CloseRangeError, DataError, InputError
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from closerange.matching.correspondences import Correspondences
+    from closerange.rig.rig import Rig
+    from closerange.workflows.match import Matched
+
+
+@verb
+def match(
+    rig: Annotated[Path, typer.Argument(metavar="RIG.json", help="Calibrated cameras.")],
+    images: Annotated[
+        list[str],
+        typer.Argument(
+            metavar="NAME=IMAGE...",
+            help="One image of each camera, two or more; points are those of the first.",
+        ),
+    ],
+    output: Annotated[Path, options.output("matches.csv")],
+    points: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="SEEDS.csv", help="Points to be found: rows of one camera, names are kept."
+        ),
+    ] = None,
+    edges: Annotated[
+        bool, typer.Option("--edges", help="All edge points; the default without --points.")
+    ] = False,
+    corners: Annotated[
+        bool, typer.Option("--corners", help="Corners: where straight pieces of edges meet.")
+    ] = False,
+    z: Annotated[
+        tuple[float, float] | None,
+        typer.Option(
+            metavar="MIN MAX",
+            help="Z of the points, mm; lifts the limits of the rig's volume in X and Y.",
+        ),
+    ] = None,
+    volume: Annotated[
+        tuple[float, float, float, float, float, float] | None,
+        typer.Option(
+            metavar="X Y Z X Y Z", help="Where the points are: lower and upper corner, mm."
+        ),
+    ] = None,
+    placement: Annotated[
+        str | None,
+        typer.Option(metavar="NAME", help="Placement; with --points, the one whose rows are used."),
+    ] = None,
+    method: Annotated[
+        str, typer.Option(help="default, or literal (the thesis' chapter 5, for comparison).")
+    ] = "default",
+    element: Annotated[
+        int | None,
+        typer.Option(
+            metavar="N", help="Side of the literal method's structuring element, px, odd (15)."
+        ),
+    ] = None,
+    ply: Annotated[
+        Path | None,
+        typer.Option(metavar="wire.ply", help="Also write positions and edges in space."),
+    ] = None,
+    _json: options.Json = False,
+) -> Outcome:
+    """Find points of one image in the images of other cameras."""
+    from closerange.matching.matches_table import write_matches
+    from closerange.rig.rig_file import read_rig
+    from closerange.workflows.match import match_images as work
+    from closerange.workflows.wire_frame import write_wire_frame
+
+    cameras = read_rig(rig)
+    named = _images(images, cameras)
+    check_outputs([output, ply], [rig, points, *named.values()])
+    with Progress("matching") as progress:
+        matched = work(
+            cameras, named, points=points, edges=edges, corners=corners, z_mm=z, volume_mm=volume,
+            placement=placement, method=method, element_px=element,  # type: ignore[arg-type]
+            progress=progress.step("matching"),
+        )  # fmt: skip
+    write_matches(matched.matches, output)
+    keep(output)
+    drawn = None if ply is None else write_wire_frame(cameras, matched.matches, ply)
+    summary = _summary(matched, output)
+    if drawn is not None:
+        summary |= {"ply": str(ply), "vertices": drawn.vertices, "lines": drawn.lines}
+    return Outcome(_text(matched, output, ply), summary, failure=_failure(matched, output))
+
+
+def _images(texts: Sequence[str], rig: Rig) -> dict[str, str]:
+    """Read ``NAME=IMAGE`` arguments; a name or a path may itself contain the sign."""
+    known = {camera.name for camera in rig.cameras}
+    named: dict[str, str] = {}
+    for text in texts:
+        places = [place for place, sign in enumerate(text) if sign == "="]
+        splits = [(text[:place], text[place + 1 :]) for place in places]
+        splits = [split for split in splits if split[0] and split[1]]
+        if not splits:
+            raise InputError(
+                f"{text!r}: expected NAME=IMAGE", remedy="for instance left=part_left.png"
+            )
+        name, path = next((split for split in splits if split[0] in known), splits[0])
+        if name in named:
+            raise InputError(
+                f"camera {name!r} is given two images: {named[name]} and {path}",
+                remedy="give one image of each camera",
+            )
+        named[name] = path
+    return named
+
+
+def _text(matched: Matched, output: Path, ply: Path | None) -> str:
+    from closerange.apps.cli.screens import flags_text, lines
+
+    matches = matched.matches
+    first, *others = matches.cameras
+    return lines(
+        ("Points", f"{int(matches.found[:, 0].sum())} of camera {first}"),
+        ("Matched", f"{int(matches.clean.sum())} without a flag in {', '.join(others)}"),
+        ("Flags", flags_text(matches.point_flags)),
+        ("Written", output),
+        ("Wire frame", ply or ""),
+    )
+
+
+def _summary(matched: Matched, output: Path) -> dict[str, Any]:
+    from closerange.apps.cli.screens import flag_counts
+
+    matches = matched.matches
+    return {
+        "points": len(matches),
+        "cameras": list(matches.cameras),
+        "matched": int(matches.matched.sum()),
+        "unflagged": int(matches.clean.sum()),
+        "flags": flag_counts(matches.point_flags),
+        "views": {name: _view(matches, column) for column, name in enumerate(matches.cameras)},
+        "volume_mm": matched.volume_mm.tolist(),
+        "doubt": matched.doubt,
+        "output": str(output),
+    }
+
+
+def _view(matches: Correspondences, column: int) -> dict[str, int]:
+    found = matches.found[:, column]
+    return {
+        "found": int(found.sum()),
+        "unflagged": int((found & (matches.flags[:, column] == 0)).sum()),
+    }
+
+
+def _failure(matched: Matched, output: Path) -> CloseRangeError | None:
+    """Say why the exit code is 1 although a table is written."""
+    matches = matched.matches
+    if matched.doubt:
+        return DataError(
+            f"{matched.doubt}; all matches in {output} are flagged",
+            remedy="give each camera its own image; the table is written to be looked at",
+        )
+    if matches.clean.any():
+        return None
+    return DataError(
+        f"none of the {len(matches)} points in {output} has a match without a flag",
+        remedy="the column flags says why; check the images, their order, the volume and that the "
+        "rig is the one that took them",
+    )

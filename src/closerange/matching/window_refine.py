@@ -1,0 +1,433 @@
+"""Sub-pixel match of windows: Gauss-Newton over place, tilt, gain and offset."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+from scipy.ndimage import map_coordinates, spline_filter
+
+from closerange.geometry.arrays import BoolArray, FloatArray, IntArray
+from closerange.matching.window_mapping import WindowMapping
+from closerange.matching.window_planes import TILT, SeedRays
+from closerange.matching.window_scores import INDEPENDENT, shape_weights
+
+ROUNDS = 10
+"""Steps of Gauss-Newton; six are enough from half a pixel away."""
+
+LONGEST_PX = 0.8
+"""Longest step, px of the level: the grey values are linear no further."""
+
+STILL_PX = 0.004
+"""A step below it ends the iteration: a fifth of what interpolation leaves."""
+
+GROSS = 2.5
+"""Residual, in standard deviations, at which a pixel has a quarter of its weight left."""
+
+MODEL_PX = 0.01
+"""Standard deviation that interpolation between pixels leaves in each match."""
+
+MOST_PIXELS = 1_000_000
+"""Pixels of all windows that are worked on at once."""
+
+FINER = np.array([[1, -8, 0, 8, -1]], dtype=np.float32) / 12
+"""Derivative exact to the fourth order: a plain difference halves that of fine texture."""
+
+GREY_VARIANCE = 1 / 12
+"""Least variance of a difference of grey values: they are whole numbers."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Refined:
+    """Refined matches of N windows.
+
+    Attributes
+    ----------
+    omega : ndarray, shape (N,)
+        Inverse depth at the seed; NaN where the fit failed.
+    std_px : ndarray, shape (N,)
+        Standard deviation along the epipolar curve.
+    across_px : ndarray, shape (N,)
+        How far beside the epipolar curve the window was found, to its right with y down.
+    misfit_px : ndarray, shape (N,)
+        Residual beyond the noise, as a shift along the curve that would cause as much.
+    likely : ndarray, shape (N,)
+        Logarithm of the likelihood against a window that explains nothing.
+    moved_px : ndarray, shape (N,)
+        Way from the start.
+    converged : ndarray of bool, shape (N,)
+        Whether the last step was short.
+    inside : ndarray, shape (N,)
+        Share of the window that both images show.
+    """
+
+    omega: FloatArray
+    std_px: FloatArray
+    across_px: FloatArray
+    misfit_px: FloatArray
+    likely: FloatArray
+    moved_px: FloatArray
+    converged: BoolArray
+    inside: FloatArray
+
+    @classmethod
+    def empty(cls, count: int) -> Refined:
+        """Return so many failed fits; arrays may be filled in."""
+        numbers = [np.full(count, np.nan) for _ in range(6)]
+        return cls(*numbers, np.zeros(count, dtype=bool), np.zeros(count))
+
+    def put(self, rows: IntArray, part: Refined) -> None:
+        """Fill in rows."""
+        for item in fields(self):
+            getattr(self, item.name)[rows] = getattr(part, item.name)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Level:
+    """Both images on one level of the pyramid, prepared.
+
+    Attributes
+    ----------
+    grey, slope_x, slope_y : ndarray of float32
+        First image and its derivatives.
+    spline : ndarray of float32
+        Coefficients of the cubic B-spline through the second image (doi:10.1117/1.429926 shows
+        that it biases sub-pixel matches ten times less than the interpolating cubics).
+    noise : tuple of two ndarrays
+        Standard deviation of the noise of both.
+    """
+
+    grey: NDArray[np.float32]
+    slope_x: NDArray[np.float32]
+    slope_y: NDArray[np.float32]
+    spline: NDArray[np.float32]
+    noise: tuple[NDArray[np.float32], NDArray[np.float32]]
+
+    @classmethod
+    def of(
+        cls,
+        images: tuple[NDArray[np.float32], NDArray[np.float32]],
+        noise: tuple[NDArray[np.float32], NDArray[np.float32]],
+    ) -> Level:
+        """Prepare a pair of images."""
+        border = cv2.BORDER_REPLICATE
+        first, second = images
+        return cls(
+            first,
+            cv2.filter2D(first, -1, FINER, borderType=border),
+            cv2.filter2D(first, -1, FINER.T.copy(), borderType=border),
+            spline_filter(second, 3, output=np.float32, mode="mirror"),
+            noise,
+        )
+
+
+@dataclass(slots=True, eq=False)
+class _State:
+    """What the iteration changes; one row for each window."""
+
+    omega: FloatArray
+    slope: FloatArray
+    turned: FloatArray
+    gain: FloatArray
+    offset: FloatArray
+    moved: FloatArray
+    across: FloatArray
+    last: FloatArray
+
+
+def refine_windows(
+    rays: SeedRays,
+    start: tuple[FloatArray, FloatArray],
+    shape: IntArray,
+    size: tuple[int, int],
+    level: Level,
+    epipolar_px: float,
+) -> Refined:
+    """Refine matches of windows of one size.
+
+    Minimises the weighted squared difference between the second image, sampled through a plane of
+    the world, and the first one after a change of gain and offset. Unknown are the place on the
+    ray, the tilt of the plane and a shift beside the epipolar curve. The tilt is held near its
+    start as loosely as surfaces may be tilted, the shift near zero as the calibration is good: both
+    have a say only where the window tells them, and what it does not tell counts in the
+    uncertainty. Pixels that do not belong to the plane lose their weight.
+
+    Parameters
+    ----------
+    rays : SeedRays
+        N seeds.
+    start : tuple of two ndarrays
+        Inverse depths, shape (N,), and tangents of the tilts, shape (N, 2).
+    shape : ndarray of int, shape (N,)
+        Number of the weights in `shape_weights`.
+    size : tuple of int
+        Half-width in pixels of the level, and how many times the level is smaller.
+    level : Level
+        Images.
+    epipolar_px : float
+        Standard deviation of the epipolar curves, which the calibration leaves.
+
+    Returns
+    -------
+    Refined
+        One row for each seed.
+    """
+    result = Refined.empty(len(rays))
+    half_width, scale = size
+    step = max(MOST_PIXELS // (2 * half_width + 1) ** 2, 1)
+    usable = np.flatnonzero(np.isfinite(start[0]) & (start[0] > 0))
+    for first in range(0, len(usable), step):
+        rows = usable[first : first + step]
+        mapping = WindowMapping.of(rays.select(rows), half_width, scale)
+        weights = shape_weights(mapping.offset.astype(np.float64), 0.5 * half_width)
+        fit = _Fit(mapping, weights[shape[rows]], level, (start[0][rows], start[1][rows]))
+        part = fit.run(epipolar_px)
+        result.put(rows, part)
+    return result
+
+
+class _Fit:
+    """One chunk of windows of one size."""
+
+    def __init__(
+        self,
+        mapping: WindowMapping,
+        weight: FloatArray,
+        level: Level,
+        start: tuple[FloatArray, FloatArray],
+    ) -> None:
+        omega, tilt = start
+        self.mapping, self.level, self.weight = mapping, level, weight
+        rays = mapping.rays
+        pace = rays.pace(omega)
+        self.pace = np.linalg.norm(pace, axis=1)
+        along = pace / self.pace[:, None]
+        self.beside = np.column_stack([-along[:, 1], along[:, 0]])
+        base = rays.slope(omega, tilt)
+        unit = [rays.slope(omega, tilt + TILT * one) - base for one in np.eye(2)]
+        tilts = np.stack(unit, axis=2) * self.pace[:, None, None]  # px per px, per hypothesis
+        self.loose = tilts @ tilts.transpose(0, 2, 1)
+        height, width = level.grey.shape
+        pixel = mapping.corner[:, None, :] + mapping.offset
+        self.inside = ((pixel >= 0) & (pixel < [width, height])).all(axis=2)
+        x, y = np.clip(pixel, 0, [width - 1, height - 1]).transpose(2, 0, 1)
+        self.grey = level.grey[y, x].astype(np.float64)
+        self.slopes = level.slope_x[y, x], level.slope_y[y, x]
+        count = len(omega)
+        self.state = _State(
+            omega=omega.copy(),
+            slope=base,
+            turned=np.zeros((count, 2)),
+            gain=np.ones(count),
+            offset=np.zeros(count),
+            moved=np.zeros(count),
+            across=np.zeros(count),
+            last=np.full(count, np.inf),
+        )
+
+    def run(self, epipolar_px: float) -> Refined:
+        """Iterate, then judge."""
+        self.beside_precision = epipolar_px**-2
+        state = self.state
+        active = np.arange(len(state.omega))
+        for turn in range(ROUNDS):
+            self._step(active, with_gain=turn == 0)
+            active = active[state.last[active] > STILL_PX * self.mapping.scale]
+            if not active.size:
+                break
+        return self._judged()
+
+    def _sampled(self, rows: IntArray) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
+        """Return the second image's values, their change with shifts, and the basic weights."""
+        mapping, state = self.mapping.select(rows), self.state
+        beside = self.beside[rows]
+        place, back, side = mapping.apply(
+            state.omega[rows], state.slope[rows], self.pace[rows], beside
+        )
+        place = place + (state.across[rows, None] * beside / mapping.scale)[:, None, :]
+        height, width = self.level.spline.shape
+        there = ((place >= 1) & (place <= [width - 2, height - 2])).all(axis=2)
+        place = np.nan_to_num(place, nan=0.0)
+        values = map_coordinates(
+            self.level.spline,
+            place.reshape(-1, 2).T[::-1],
+            order=3,
+            mode="mirror",
+            prefilter=False,
+            output=np.float64,
+        ).reshape(place.shape[:2])
+        change, change_2 = (
+            self.slopes[0][rows] * step[..., 0] + self.slopes[1][rows] * step[..., 1]
+            for step in (back, side)
+        )
+        good = there & self.inside[rows] & np.isfinite(change)
+        change, change_2 = np.where(good, change, 0.0), np.where(good, change_2, 0.0)
+        return values, change, change_2, np.where(good, self.weight[rows], 0.0)
+
+    def _step(self, rows: IntArray, *, with_gain: bool) -> None:
+        state = self.state
+        sampled = self._sampled(rows)
+        if with_gain:
+            state.gain[rows], state.offset[rows] = _gain(self.grey[rows], sampled[0], sampled[3])
+        system = self._system(rows, *sampled)
+        move = np.linalg.solve(system.normal, system.right[:, :, None])[:, :, 0]
+        limit = LONGEST_PX * self.mapping.scale
+        shift = np.clip(move[:, 0], -limit, limit)
+        # a limited step keeps its direction
+        move = move * np.where(move[:, 0] != 0, shift / move[:, 0], 1.0)[:, None]
+        state.omega[rows] += shift / self.pace[rows]
+        state.slope[rows] += move[:, 1:3] / self.pace[rows, None]
+        state.turned[rows] += move[:, 1:3]
+        state.gain[rows] = np.clip(state.gain[rows] + move[:, 3], 0.05, 20.0)
+        state.offset[rows] += move[:, 4]
+        state.moved[rows] += shift
+        state.across[rows] += move[:, 5]
+        state.last[rows] = np.abs(shift)
+
+    def _system(
+        self,
+        rows: IntArray,
+        values: FloatArray,
+        change: FloatArray,
+        beside: FloatArray,
+        weight: FloatArray,
+    ) -> _System:
+        state = self.state
+        grey = self.grey[rows]
+        error = values - state.gain[rows, None] * grey - state.offset[rows, None]
+        spread = _spread(error, weight)
+        trust = weight / (1 + (error / (GROSS * spread[:, None])) ** 2) ** 2
+        gain = state.gain[rows, None]
+        gained = gain * change
+        x, y = self.mapping.offset.T * float(self.mapping.scale)
+        basis = np.stack(
+            [gained, gained * x, gained * y, -grey, -np.ones_like(grey), gain * beside], axis=2
+        )
+        weighted = basis * trust[:, :, None]
+        normal = weighted.transpose(0, 2, 1) @ basis
+        right = -np.einsum("npk,np->nk", weighted, error)
+        # tilt and shift beside the curve are known beforehand, though not well
+        prior = np.zeros_like(normal)
+        prior[:, 1:3, 1:3] = _inverse(self.loose[rows])
+        prior[:, 5, 5] = self.beside_precision
+        prior *= spread[:, None, None] ** 2
+        normal += prior
+        right[:, 1:3] -= np.einsum("nij,nj->ni", prior[:, 1:3, 1:3], state.turned[rows])
+        right[:, 5] -= prior[:, 5, 5] * state.across[rows]
+        normal += 1e-9 * np.eye(6) * np.trace(normal, axis1=1, axis2=2)[:, None, None]
+        return _System(normal, right, basis, trust, error, prior)
+
+    def _judged(self) -> Refined:
+        state, scale = self.state, self.mapping.scale
+        rows = np.arange(len(state.omega))
+        sampled = self._sampled(rows)
+        values, weight = sampled[0], sampled[3]
+        system = self._system(rows, *sampled)
+        trust, error = system.trust, system.error
+        mass = np.maximum(trust.sum(axis=1), 1e-12)
+        count = mass**2 / np.maximum((trust**2).sum(axis=1), 1e-12)
+        free = np.maximum(count - 6, 1.0)
+        variance = np.einsum("np,np->n", trust, error**2) / mass * count / free + GREY_VARIANCE
+        std = self._std(system, variance)
+        noise = self._noise(rows)
+        steep = np.einsum("np,np->n", trust, system.basis[:, :, 0] ** 2) / mass
+        with np.errstate(divide="ignore", invalid="ignore"):
+            misfit = np.sqrt(np.maximum(variance - noise, 0.0) / steep)
+        total = np.maximum(weight.sum(axis=1), 1e-12)
+        whole = np.einsum("np,np->n", weight, error**2) / total
+        mean = np.einsum("np,np->n", weight, values) / total
+        contrast = np.einsum("np,np->n", weight, (values - mean[:, None]) ** 2) / total
+        independent = INDEPENDENT * total**2 / np.maximum((weight**2).sum(axis=1), 1e-12)
+        share = np.clip(whole / np.maximum(contrast, 1e-12), 1e-3, 1.0)
+        seen = total / self.weight.sum(axis=1)
+        failed = ~np.isfinite(state.omega) | (state.omega <= 0) | (seen < 0.3)
+        return Refined(
+            omega=np.where(failed, np.nan, state.omega),
+            std_px=np.where(failed, np.nan, np.hypot(std, MODEL_PX * scale)),
+            across_px=np.where(failed, np.nan, state.across),
+            misfit_px=np.where(failed, np.nan, misfit),
+            likely=np.where(failed, 0.0, -0.5 * independent * np.log(share)),
+            moved_px=state.moved,
+            converged=(state.last < 5 * STILL_PX * scale) & ~failed,
+            inside=seen,
+        )
+
+    def _std(self, system: _System, variance: FloatArray) -> FloatArray:
+        """Return the standard deviation of the shift, px: noise, misfit and unknown tilt."""
+        # neighbouring residuals are alike where noise was interpolated or the plane does not fit:
+        # their mean falls off more slowly than that of independent ones
+        alike = self._alike(system)
+        inverse = np.linalg.inv(system.normal)
+        doubled = system.basis * system.trust[:, :, None]
+        middle = doubled.transpose(0, 2, 1) @ doubled
+        middle *= alike[:, None, None]
+        middle += system.prior
+        cov = inverse @ middle @ inverse
+        return np.asarray(np.sqrt(np.maximum(cov[:, 0, 0] * variance, 0.0)))
+
+    def _alike(self, system: _System) -> FloatArray:
+        side = int(np.sqrt(system.error.shape[1]))
+        error = (system.error * np.sqrt(system.trust)).reshape(-1, side, side)
+        own = np.maximum((error**2).sum(axis=(1, 2)), 1e-12)
+        alike = np.ones(len(own))
+        for shifted in (error[:, 1:] * error[:, :-1], error[:, :, 1:] * error[:, :, :-1]):
+            lag = np.clip(shifted.sum(axis=(1, 2)) / own, 0.0, 0.8)
+            alike *= (1 + lag) / (1 - lag)
+        return alike
+
+    def _noise(self, rows: IntArray) -> FloatArray:
+        """Return the variance of the difference that the noise of both images causes."""
+        x, y = self.mapping.corner.T
+        first, second = self.level.noise
+        height, width = first.shape
+        here = first[np.clip(y, 0, height - 1), np.clip(x, 0, width - 1)]
+        mapping, state = self.mapping, self.state
+        place = mapping.rays.second.project(mapping.rays.at(state.omega[rows])) / mapping.scale
+        height, width = second.shape
+        u, v = np.clip(np.nan_to_num(np.rint(place)), 0, [width - 1, height - 1]).astype(int).T
+        return np.asarray((state.gain[rows] * here) ** 2 + second[v, u] ** 2)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _System:
+    """Normal equations of a chunk and what they are made of."""
+
+    normal: FloatArray
+    right: FloatArray
+    basis: FloatArray
+    trust: FloatArray
+    error: FloatArray
+    prior: FloatArray
+
+
+def _gain(grey: FloatArray, values: FloatArray, weight: FloatArray) -> tuple[Any, Any]:
+    """Return gain and offset of a straight-line fit of values over grey, shape (N,) each."""
+    total = np.maximum(weight.sum(axis=1), 1e-12)
+    mean_1 = np.einsum("np,np->n", weight, grey) / total
+    mean_2 = np.einsum("np,np->n", weight, values) / total
+    apart_1, apart_2 = grey - mean_1[:, None], values - mean_2[:, None]
+    shared = np.einsum("np,np,np->n", weight, apart_1, apart_2)
+    own = np.einsum("np,np->n", weight, apart_1**2)
+    other = np.einsum("np,np->n", weight, apart_2**2)
+    # a start a pixel off has little correlation: the ratio of contrasts is the better gain
+    ratio = np.sqrt(other / np.maximum(own, 1e-12))
+    gain = np.clip(np.maximum(shared / np.maximum(own, 1e-12), 0.5 * ratio), 0.05, 20.0)
+    return gain, mean_2 - gain * mean_1
+
+
+def _spread(error: FloatArray, weight: FloatArray) -> FloatArray:
+    """Return the standard deviation of the residuals, blind to the worse half, shape (N,)."""
+    counted = weight > 0.1
+    size = np.where(counted, np.abs(error), np.nan)
+    size[~counted.any(axis=1)] = 1.0
+    spread = 1.4826 * np.nanmedian(size, axis=1)
+    return np.asarray(np.maximum(spread, np.sqrt(GREY_VARIANCE)))
+
+
+def _inverse(matrix: FloatArray) -> FloatArray:
+    """Invert 2 x 2 covariances; those of cameras that see no tilt are held fast."""
+    size = np.trace(matrix, axis1=1, axis2=2)[:, None, None]
+    return np.asarray(np.linalg.inv(matrix + np.eye(2) * np.maximum(1e-6 * size, 1e-10)))

@@ -1,0 +1,186 @@
+"""What the verb `match` is given, checked before anything is sought: images, points, volume."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from closerange.errors import InputError
+from closerange.features.image_points import ImagePoints
+from closerange.features.points_table import read_points
+from closerange.flags import Flag
+from closerange.geometry.arrays import FloatArray
+from closerange.images import Frame, check_duplicates, check_frame, read_image
+from closerange.matching.correspondences import Correspondences
+from closerange.matching.sight import between_planes, checked_volume
+from closerange.rig.rig import Rig
+
+Images = Mapping[str, str | Path | Frame]
+Points = ImagePoints | Correspondences | Path | str
+
+
+def read_frames(rig: Rig, images: Images) -> dict[str, Frame]:
+    """Read one image of each camera and check it.
+
+    Parameters
+    ----------
+    rig : Rig
+        Gives cameras and sizes.
+    images : mapping of str to path or Frame
+        By camera.
+
+    Returns
+    -------
+    dict of str to Frame
+        In the order given.
+
+    Raises
+    ------
+    InputError
+        If there are fewer than two, a camera is not in the rig, an image has another size than
+        its camera or one image is given for two cameras.
+    DetectionError
+        If an image is uniform.
+    """
+    if len(images) < 2:
+        raise InputError(
+            f"{len(images)} image: a match needs two views of different cameras",
+            remedy="give one image of each camera, NAME=IMAGE NAME=IMAGE",
+        )
+    frames: dict[str, Frame] = {}
+    for name, image in images.items():
+        camera = rig.camera(name)
+        frame = image if isinstance(image, Frame) else read_image(image, camera=name)
+        if frame.camera not in ("", name):
+            raise InputError(
+                f"the image given for camera {name!r} says that it is of camera {frame.camera!r}",
+                remedy="give each camera its own image",
+            )
+        if frame.size_px != camera.size_px:
+            raise InputError(_wrong_size(rig, name, frame), remedy=(
+                "use images of the calibrated size, or calibrate with images of this one"
+            ))  # fmt: skip
+        frames[name] = Frame(name, frame.pixels, frame.time_s, frame.source)
+    for frame in frames.values():
+        check_frame(frame)
+    check_duplicates(frames.values())
+    return frames
+
+
+def _wrong_size(rig: Rig, name: str, frame: Frame) -> str:
+    sizes = [f"{width}x{height}" for width, height in (frame.size_px, rig.camera(name).size_px)]
+    fits = [other.name for other in rig.cameras if other.size_px == frame.size_px]
+    hint = f"; it would fit camera {', '.join(map(repr, fits))}" if fits else ""
+    where = f"{frame.source}: " if frame.source else ""
+    return f"{where}image of {sizes[0]} px; camera {name!r} was calibrated with {sizes[1]} px{hint}"
+
+
+def read_seeds(points: Points, cameras: Mapping[str, object], placement: str | None) -> ImagePoints:
+    """Return the points for which matches are sought: rows of one camera and one placement.
+
+    Parameters
+    ----------
+    points : ImagePoints, Correspondences or path
+        Rows of one camera; of `Correspondences` the first camera's, its seeds.
+    cameras : mapping
+        Names of the cameras that have an image.
+    placement : str, optional
+        Keep the rows of this placement only.
+
+    Returns
+    -------
+    ImagePoints
+        At least one row, all of one camera, placement and reading; what has no position and no
+        flag is flagged `not_found`.
+
+    Raises
+    ------
+    InputError
+        If the rows are of several cameras, placements or readings, of a camera without an image,
+        or there are none.
+    """
+    where = f"{points}: " if isinstance(points, (str, Path)) else ""
+    table = _as_points(points)
+    if placement is not None:
+        table = table.select(np.array([name == placement for name in table.placement], np.bool_))
+    if not len(table):
+        of_placement = "" if placement is None else f" of placement {placement!r}"
+        raise InputError(f"{where}no points{of_placement}", remedy="give at least one point")
+    if len(table.cameras) > 1:
+        raise InputError(
+            f"{where}points of {len(table.cameras)} cameras ({', '.join(table.cameras)}); matches "
+            "are sought for the points of one",
+            remedy="keep the rows of one camera; points that all cameras have can be measured",
+        )
+    camera = table.cameras[0]
+    if camera not in cameras:
+        raise InputError(
+            f"{where}points of camera {camera!r}; the images are of {', '.join(cameras)}",
+            remedy=f"give {camera}=IMAGE too, or points of another camera",
+        )
+    _require_one_state(table, where)
+    lost = ~table.found & (table.flags == 0)
+    return replace(table, flags=np.where(lost, int(Flag.not_found), table.flags))
+
+
+def _as_points(points: Points) -> ImagePoints:
+    if isinstance(points, ImagePoints):
+        return points
+    if isinstance(points, Correspondences):
+        rows = points.to_image_points()
+        return rows.of_camera(points.cameras[0]) if points.cameras else rows
+    return read_points(points)
+
+
+def _require_one_state(table: ImagePoints, where: str) -> None:
+    """Refuse points of several states of the world: the images show one."""
+    for what, names in (("placements", table.placement), ("readings", table.reading)):
+        distinct = list(dict.fromkeys(names))
+        if len(distinct) > 1:
+            some = ", ".join(
+                [*(repr(name) for name in distinct[:3]), *["..."][: len(distinct) > 3]]
+            )
+            choice = ", with --placement" if what == "placements" else ""
+            raise InputError(
+                f"{where}points of {len(distinct)} {what} ({some}); the images show one state",
+                remedy=f"match the points of one state with its images{choice}",
+            )
+
+
+def volume_of(
+    rig: Rig, z_mm: tuple[float, float] | None, volume_mm: ArrayLike | None
+) -> FloatArray:
+    """Return where points may be: the rig's volume unless another one is given.
+
+    Parameters
+    ----------
+    rig : Rig
+        Its measuring volume is the default.
+    z_mm : (float, float), optional
+        Replaces the volume in Z and lifts its limits in X and Y.
+    volume_mm : array_like, shape (2, 3), optional
+        Replaces the volume; lower and upper corner.
+
+    Returns
+    -------
+    ndarray, shape (2, 3)
+        In mm, infinite where there is no limit.
+
+    Raises
+    ------
+    InputError
+        If both are given, or limits are not in order.
+    """
+    if z_mm is not None and volume_mm is not None:
+        raise InputError(
+            "both --z and --volume were given", remedy="give one: --z lifts the limits in X and Y"
+        )
+    if z_mm is not None:
+        return between_planes(*z_mm)
+    if volume_mm is None:
+        return rig.volume_mm
+    return checked_volume(np.reshape(np.asarray(volume_mm, np.float64), (2, 3)))
