@@ -171,3 +171,40 @@ def test_patterns_find_their_files(project):
     found = images_of(settings, ["left_*.png", "deep/left_?.png"])
     names = [path.relative_to(settings.folder).as_posix() for path in found]
     assert names == ["left_1.png", "left_2.png", "deep/left_3.png"]
+
+
+LIMITED = """truth = "truth.csv"
+limits = { accuracy_mm = [0.01, 0.01, 0.03], repeatability_mm = 1, confidence = 0.99 }
+"""
+
+
+def test_limits_of_a_job(project):
+    (job,) = read_settings(project('truth = "truth.csv"\n', LIMITED)).job
+    assert job.limits.accuracy_mm == [0.01, 0.01, 0.03]
+    assert (job.limits.repeatability_mm, job.limits.cycle_time_s) == (1.0, None)
+    assert job.limits.confidence == 0.99
+
+
+@pytest.mark.parametrize(
+    ("limits", "word"),
+    [
+        ("accuracy_mm = 0", "accuracy_mm"),
+        ("accuracy_mm = [1.0, 2.0]", "accuracy_mm"),
+        ("repeatability_mm = [1.0, 2.0, -3.0]", "repeatability_mm"),
+        ("cycle_time_s = nan", "cycle_time_s"),
+        ("confidence = 0.9", "without any limit"),
+        ("accuracy_mm = 1, confidence = 1.0", "confidence"),
+        ("speed = 1", "speed"),
+    ],
+)
+def test_impossible_limits(project, limits, word):
+    with pytest.raises(SchemaError, match=word):
+        read_settings(
+            project('truth = "truth.csv"\n', f'truth = "t.csv"\nlimits = {{ {limits} }}\n')
+        )
+
+
+def test_limits_without_a_single_point_test(project):
+    text = 'verify = "lengths"\ntruth = "truth.csv"\nlimits = { accuracy_mm = 1.0 }\n'
+    with pytest.raises(SchemaError, match="limits are those of"):
+        read_settings(project('verify = "single-point"\ntruth = "truth.csv"\n', text))

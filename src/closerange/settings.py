@@ -20,15 +20,31 @@ Paths are relative to the project file and stay inside its folder. ::
     verify = "single-point"
     truth = "verify/truth.csv"
     limits = { accuracy_mm = [0.01, 0.01, 0.03], repeatability_mm = 0.01 }
+
+    [[job]]
+    name = "blocks"
+    match = "edges"
+    images = { left = ["blocks/left.png"], right = ["blocks/right.png"] }
+    z_mm = [-52.0, 28.0]
+    verify = "heights"
+    truth = "blocks/parts.csv"
 """
 
 from __future__ import annotations
 
 import tomllib
 from pathlib import Path
-from typing import Annotated, Literal, Self
+from typing import Annotated, Any, Literal, Self
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+from pydantic import (
+    BaseModel,
+    ConfigDict,
+    Discriminator,
+    Field,
+    Tag,
+    ValidationError,
+    model_validator,
+)
 
 from closerange.errors import FileError, SchemaError
 from closerange.files import read_text
@@ -160,6 +176,68 @@ class Job(Detection):
         return self
 
 
+class MatchJob(_Table):
+    """A scene without a target: points of one image are found in the others and measured.
+
+    Attributes
+    ----------
+    name : str
+        Names its output files.
+    match : str
+        ``edges``, ``corners``, ``centroids`` (of bright faces) or ``points``.
+    images : dict of str to list of str
+        Camera name: its one image. The points are those of the first camera, unless `points` are
+        of another.
+    points : str or None
+        Points table, with ``match = "points"`` only.
+    z_mm : list of float or None
+        Least and largest Z of the points; lifts the limits of the rig's volume in X and Y.
+    volume_mm : list of float or None
+        Where the points are instead: lower corner, upper corner.
+    method : str
+        ``default`` or ``literal``.
+    element_px : int or None
+        Side of the literal method's structuring element.
+    verify : str or None
+        ``heights`` of parts, or ``control`` for points by name.
+    truth : str or None
+        Table of parts, or control table.
+    """
+
+    name: Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9 ._-]*$")]
+    match: Literal["edges", "corners", "centroids", "points"]
+    images: Annotated[dict[Name, list[Name]], Field(min_length=2)]
+    points: Name | None = None
+    z_mm: Annotated[list[float], Field(min_length=2, max_length=2)] | None = None
+    volume_mm: Annotated[list[float], Field(min_length=6, max_length=6)] | None = None
+    method: Literal["default", "literal"] = "default"
+    element_px: int | None = None
+    verify: Literal["heights", "control"] | None = None
+    truth: Name | None = None
+
+    @model_validator(mode="after")
+    def _belongs_together(self) -> Self:
+        if (self.verify is None) != (self.truth is None):
+            raise ValueError("verify and truth go together")
+        if (self.match == "points") != (self.points is not None):
+            raise ValueError('points go with match = "points"')
+        if self.z_mm is not None and self.volume_mm is not None:
+            raise ValueError("z_mm and volume_mm exclude each other")
+        return self
+
+
+def _kind_of_job(job: Any) -> str:
+    """Tell a job that matches from one that detects a target."""
+    matches = "match" in job if isinstance(job, dict) else isinstance(job, MatchJob)
+    return "a scene" if matches else "a target"
+
+
+AnyJob = Annotated[
+    Annotated[Job, Tag("a target")] | Annotated[MatchJob, Tag("a scene")],
+    Discriminator(_kind_of_job),
+]
+
+
 class Outputs(_Table):
     """Where results go.
 
@@ -185,7 +263,7 @@ class Settings(_Table):
         For reports.
     calibration : Calibration
         How the rig is calibrated.
-    job : list of Job
+    job : list of Job or MatchJob
         What is measured.
     outputs : Outputs
         Where results go.
@@ -195,7 +273,7 @@ class Settings(_Table):
     schema_: Literal["closerange.project/1"] = Field(alias="schema")
     title: Name = "Close-range measurement"
     calibration: Calibration
-    job: list[Job] = []
+    job: list[AnyJob] = []
     outputs: Outputs = Outputs()
 
     @model_validator(mode="after")
@@ -241,7 +319,8 @@ def read_settings(path: Path | str) -> Settings:
         return Settings.model_validate({**document, "folder": path.parent})
     except ValidationError as error:
         first = error.errors()[0]
-        where = ".".join(str(part) for part in first["loc"]) or "project"
+        place = [str(part) for part in first["loc"] if part not in ("a target", "a scene")]
+        where = ".".join(place) or "project"
         raise SchemaError(
             f"{path}: {where}: {first['msg']}", remedy="see 'Project file' in the documentation"
         ) from error

@@ -114,10 +114,10 @@ def test_item_46_target_file_too_large(tables, refused):
     refused(args, 2, "plate.toml", "limit")
 
 
-@pytest.mark.parametrize("schema", ["closerange.rig/2", "closerange.result/1", "", None, 1])
+@pytest.mark.parametrize("schema", ["closerange.rig/3", "closerange.result/1", "", None, 1])
 def test_item_47_unknown_schema(tables, refused, schema):
     edit(tables, lambda document: document.update(schema=schema))
-    refused(tables.measure, 2, "rig.json", "schema", "closerange.rig/1")
+    refused(tables.measure, 2, "rig.json", "schema", "closerange.rig/2")
 
 
 def test_item_47_unknown_kind_of_target(tables, refused):
@@ -184,6 +184,9 @@ BAD_CAMERAS = {
     "unknown parameter": (lambda d: d["parameters"].__setitem__(0, "left.zoom"), "parameters"),
     "unknown verdict": (lambda d: d["trust"].update(verdict="excellent"), "trust"),
     "negative noise": (lambda d: d.update(noise_px=-0.1), "noise_px"),
+    "no noise": (lambda d: d.update(noise_px=0), "noise_px"),
+    "unknown noise": (lambda d: d.update(noise_px=None), "noise_px"),
+    "unknown covariance": (lambda d: d["parameter_cov"][0].__setitem__(0, None), "parameter_cov"),
     "noise as a truth value": (lambda d: d.update(noise_px=True), "noise_px"),
     "unknown flag": (lambda d: d["residuals"]["rows"][0].__setitem__(11, "odd"), "residuals"),
     "short residual row": (lambda d: d["residuals"]["rows"][0].pop(), "residuals"),
@@ -195,6 +198,27 @@ def test_item_48_rig_with_impossible_content(tables, refused, what):
     change, words = BAD_CAMERAS[what]
     edit(tables, change)
     refused(tables.measure, 2, "rig.json", words)
+
+
+def test_item_48_what_an_untrusted_rig_of_unknown_uncertainty_measures_is_marked(
+    tables, run, tmp_path
+):
+    """Positions without covariance: no traceback, no row without a flag, exit code 1."""
+
+    def unknown(document):
+        document["trust"]["verdict"] = "untrustworthy"
+        document["noise_px"] = None
+        document["parameter_cov"][0][0] = None
+
+    edit(tables, unknown)
+    outcome = run(*tables.measure, "-o", tmp_path / "positions.csv")
+    assert outcome.code == 1
+    rows = (tmp_path / "positions.csv").read_text(encoding="utf-8").splitlines()
+    assert len(rows) == 64
+    for row in rows[1:]:
+        assert row.endswith("untrusted")
+        assert ",,,,,," in row  # no covariance
+        float(row.split(",")[2])
 
 
 def test_item_48_verify_reads_the_rig_as_strictly(tables, run, refused, tmp_path):

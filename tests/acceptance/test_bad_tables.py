@@ -318,7 +318,7 @@ def test_item_43_calibration_of_other_cameras_is_noticed(tables, run, tmp_path):
     tables.rig.write_text(json.dumps(document), encoding="utf-8")
     outcome = run(*tables.measure, "-o", tmp_path / "positions.csv")
     assert outcome.code == 1  # no row without a flag
-    assert "warning: the rays of 63 of 63 points miss each other" in outcome.stderr
+    assert "error: the rays of 63 of 63 points miss each other" in outcome.stderr
     rows = (tmp_path / "positions.csv").read_text(encoding="utf-8").splitlines()[1:]
     assert all("residual" in row.rsplit(",", 1)[1] for row in rows)
 

@@ -117,11 +117,10 @@ def test_positions_and_verification(chain):
     folder, found = chain
     assert found["measure"]["measured"] == found["measure"]["rows"] == 9
     result = found["verify"]
-    assert (result["kind"], result["positions"], result["decision"]) == (
-        "single-point",
-        3,
-        "accept",
-    )
+    assert (result["kind"], result["positions"]) == ("single-point", 3)
+    # within its limits, but of the 90 positions that were to be tested 87 were not
+    assert result["decision"] == "undecided"
+    assert result["reservations"] == ["87 of 90 actual positions have no usable reading"]
     # 3.4 px a mm: 0.02 px are 0.006 mm, three times that in depth; measured 0.0028 mm
     assert max(result["accuracy_mm"]) < 0.02
     assert (folder / "verify.html").is_file()

@@ -104,7 +104,7 @@ def test_a_length_is_judged_by_what_chance_explains(length_check, error, judged)
 
 def test_what_was_not_measured_is_said(length_check):
     found = _answers(checks=[length_check])
-    assert "1 row not measured." in found["Why not"]
+    assert "1 of 2 lengths were not measured." in found["Why not"]
 
 
 def test_counts_are_those_of_all_jobs(positions, points):

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from closerange.errors import TableError
+from closerange.errors import InputError, TableError
 from closerange.features.control import ControlPoints, read_control, write_control
 from closerange.features.image_points import ImagePoints
 
@@ -116,3 +116,15 @@ def test_columns_of_unequal_length_are_refused():
         ControlPoints.of(["a", "b"], [[0, 0, 0]])
     with pytest.raises(ValueError, match="differ in length"):
         ControlPoints.of(["a"], [[0, 0, 0]], placement=["x", "y"])
+
+
+@pytest.mark.parametrize("value", [np.nan, np.inf])
+def test_a_position_that_is_not_known_is_refused_by_name(value):
+    with pytest.raises(InputError, match=r"control point 'b' of placement 'p1': its position"):
+        ControlPoints.of(["a", "b"], [[0, 0, 0], [0, value, 0]], placement=["", "p1"])
+
+
+@pytest.mark.parametrize("value", [np.nan, np.inf, -0.1])
+def test_what_is_no_standard_deviation_is_refused_by_name(value):
+    with pytest.raises(InputError, match=r"control point 'b': .* mm is no standard deviation"):
+        ControlPoints.of(["a", "b"], np.zeros((2, 3)), std_mm=[0.0, value])

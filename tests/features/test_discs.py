@@ -214,6 +214,68 @@ def test_flags_name_the_defect():
     assert flags_of(50 + 130 * ghost) == Flag.poor_fit
 
 
+@pytest.mark.parametrize("blur_px", [0.05, 0.3, 0.5])
+@pytest.mark.parametrize(("scale", "noise"), [(1.0, 0.0), (1.0, 0.3), (250.0, 30.0)])
+def test_sharp_discs_with_little_noise_are_not_poor_fits(blur_px, scale, noise):
+    """A Gaussian edge is not that of a square pixel; 0.02 of the contrast, on all sides alike."""
+    ellipses = grid()
+    level = scale * (30 + 190 * draw(ellipses, blur_px=blur_px))
+    noisy = level + np.random.default_rng(3).normal(0, noise or 1e-9, level.shape)
+    pixels = np.rint(noisy).astype(np.uint16 if scale > 1 else np.uint8)
+    discs = find_discs(Frame("c", pixels), polarity="white-on-dark")
+    assert len(discs) == 9
+    assert not discs.flags.any()
+    errors, _ = errors_of(discs, np.array([ellipse.centre for ellipse in ellipses]))
+    assert np.sqrt(np.mean(errors**2)) < 0.01  # 0.0005 to 0.006 px
+
+
+@pytest.mark.parametrize("noise", [0.3, 2.0])
+def test_what_is_not_a_whole_disc_is_a_poor_fit_at_any_noise(noise):
+    whole = draw([Ellipse.of((120.3, 99.6), 14, 12, 0.2)])
+    columns = np.arange(whole.shape[1])
+    spot = draw([Ellipse.of((128.0, 95.0), 6, 5, 0.2)])
+    square = np.zeros(whole.shape)
+    square[90:102, 110:122] = 1
+    for share in (
+        np.where(columns < 120, 0.5, 1.0) * whole,  # half of it in the shade
+        np.where(columns < 124, 1.0, 0.0) * whole,  # a third covered
+        whole + 0.6 * spot,  # glare
+        whole + 0.2 * spot,
+        square,
+    ):
+        assert flags_of(50 + 120 * share, noise=noise) & Flag.poor_fit
+
+
+@pytest.mark.parametrize("radius_px", [2.0, 5.0])
+def test_a_defocused_lens_is_not_a_poor_fit(radius_px):
+    """Its edge is that of a flat disc, not of a Gaussian."""
+    reach = int(np.ceil(radius_px * FINE))
+    y, x = np.mgrid[-reach : reach + 1, -reach : reach + 1]
+    kernel = (np.hypot(x, y) <= radius_px * FINE).astype(np.float64)
+    one = Ellipse.of((120.3, 99.6), 24, 21, 0.2)
+    fine = np.meshgrid(*((np.arange(n * FINE) + 0.5) / FINE - 0.5 for n in (240, 200)))
+    share = np.clip(0.5 - one.signed_distance(np.stack(fine, axis=-1)) * FINE, 0, 1)
+    share = cv2.filter2D(share, -1, kernel / kernel.sum())
+    level = 50 + 130 * share.reshape(200, FINE, 240, FINE).mean(axis=(1, 3))
+    discs = find_discs(frame_of(level, noise=0.5), polarity="white-on-dark")
+    assert len(discs) == 1
+    assert not discs.flags.any()
+    assert np.abs(discs.xy_px[0] - one.centre).max() < 0.01  # 0.001 to 0.002 px
+
+
+def test_small_noisy_dots_converge():
+    """Blur, size and contrast of a dot of 3 px hang together: undamped steps never settle."""
+    rng = np.random.default_rng(7)
+    centres = [(x, y) for x in range(25, 230, 24) for y in range(25, 190, 24)]
+    ellipses = [Ellipse.of(np.array(c) + rng.uniform(-0.5, 0.5, 2), 3.0, 2.7) for c in centres]
+    frame = frame_of(60 + 50 * draw(ellipses, blur_px=0.35), noise=6.0)
+    discs = find_discs(frame, polarity="white-on-dark")
+    errors, rows = errors_of(discs, np.array([ellipse.centre for ellipse in ellipses]))
+    settled = (discs.flags[rows] & Flag.not_converged) == 0
+    assert settled.mean() > 0.95  # 0.68 while the damping fell after every step downhill
+    assert np.sqrt(np.mean(errors[settled] ** 2)) < 0.09
+
+
 def test_saturation_level_is_that_of_the_sensor():
     assert saturation_level(Frame("c", np.zeros((4, 4), np.uint8))) == 255
     deep = np.zeros((4, 4), np.uint16)

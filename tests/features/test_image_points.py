@@ -131,3 +131,28 @@ def test_no_rows():
     assert len(empty) == 0
     assert empty.cameras == ()
     assert len(empty + two()) == 2
+
+
+@pytest.mark.parametrize("name", ["cov_px2", "noise_cov_px2"])
+@pytest.mark.parametrize(
+    "matrix",
+    [
+        [[1e-3, 1.0], [1.0, 1e-3]],
+        [[0.0, 0.0], [0.0, 0.0]],
+        [[-1.0, 0.0], [0.0, 1.0]],
+        [[1.0, 1.0], [1.0, 1.0]],
+        [[1.0, 0.1], [0.2, 1.0]],
+        [[1.0, np.nan], [np.nan, 1.0]],
+        [[np.inf, 0.0], [0.0, 1.0]],
+    ],
+    ids=["indefinite", "zero", "negative", "singular", "unsymmetric", "in part", "infinite"],
+)
+def test_what_is_no_covariance_is_refused_by_name(name, matrix):
+    cov = np.array([np.eye(2), matrix])
+    with pytest.raises(InputError, match=f"camera 'left', point '01': {name} = .* not a covarianc"):
+        two(**{name: cov})
+
+
+def test_covariances_that_rounding_made_unsymmetric_are_fine():
+    cov = np.array([[1.0, 0.3], [0.3 * (1 + 1e-12), 2.0]])
+    assert two(cov_px2=cov).cov_px2[0, 1, 0] == cov[1, 0]

@@ -50,6 +50,20 @@ def test_decay_equals_scipy(start):
     assert fit.cost == pytest.approx(2 * peer.cost, rel=1e-10)
 
 
+@pytest.mark.parametrize("curvature", [-0.9, -0.97, -1.1])
+def test_large_residuals_do_not_make_it_leap_from_side_to_side(curvature):
+    """Steps without damping multiply x by the curvature (Dennis and Schnabel's example)."""
+
+    def function(x):
+        values = np.array([x[0] + 1, curvature * x[0] ** 2 + x[0] - 1])
+        return values, np.array([[1.0], [2 * curvature * x[0] + 1]])
+
+    fit = levenberg_marquardt(function, [0.3], gain_limit=1e-10)
+    assert fit.converged
+    assert abs(fit.x[0]) < 1e-5
+    assert fit.iterations < 20  # 8; 92, 200 and 178 with less damping after every step downhill
+
+
 def test_units_do_not_matter():
     scale = np.array([1e6, 1e-5, 1e3])
     plain = levenberg_marquardt(decay, [1, 1, 0])
@@ -127,3 +141,31 @@ def test_larger_gain_limit_stops_earlier():
 def test_same_input_same_output():
     first, second = (levenberg_marquardt(decay, [10, 0.1, -3]) for _ in range(2))
     np.testing.assert_array_equal(first.x, second.x)
+
+
+def rounded_line(rounding):
+    """Exact points of a curve far from the origin, rounded; the residuals are differences."""
+    seen = 640 + 300 * np.exp(-1.3 * T)
+    if rounding:
+        seen = np.round(seen / rounding) * rounding
+
+    def function(x):
+        e = np.exp(-x[1] * T)
+        return (x[2] + x[0] * e) - seen, np.column_stack([e, -x[0] * T * e, np.ones_like(T)])
+
+    return function, float(seen @ seen)
+
+
+@pytest.mark.parametrize("rounding", [0.0, 1e-9, 1e-6])
+def test_exact_data_converge_at_their_rounding(rounding):
+    function, terms = rounded_line(rounding)
+    fit = levenberg_marquardt(function, [250, 1, 600], terms=terms)
+    assert fit.converged
+    assert fit.iterations < 15
+    np.testing.assert_allclose(fit.x, [300, 1.3, 640], rtol=max(1e-12, rounding))
+
+
+def test_terms_do_not_stop_a_search_that_still_gains():
+    plain = levenberg_marquardt(decay, [10, 0.1, -3])
+    fit = levenberg_marquardt(decay, [10, 0.1, -3], terms=float(Y @ Y))
+    np.testing.assert_array_equal(fit.x, plain.x)

@@ -14,6 +14,7 @@ from closerange.features.image_points import ImagePoints
 from closerange.flags import Flag
 from closerange.geometry.transform import RigidTransform, rotation_from_vector
 from closerange.position.measure import measure_points
+from closerange.rig.distortion import BrownIdeal
 from closerange.rig.rig import Trust
 from closerange.verification.scenes import (
     SyntheticRig,
@@ -400,3 +401,95 @@ def test_discs_are_measured_at_their_centres():
     error = np.linalg.norm(measure_points(rig, points).xyz_mm - centre)
     assert np.linalg.norm(biased.xyz_mm - centre) > 0.1
     assert error < 0.002  # measured 7e-5 mm
+
+
+def beyond_the_fold(xy_third, xyz_mm):
+    """Three cameras, of which the third's lens folds back at 348 px, within its image.
+
+    The third looks from nearby, so that `xyz_mm` lies beyond its fold.
+    """
+    lens = BrownIdeal(k1=-0.6)
+    third = looking_at_origin(
+        "third", angle_rad=0.0, distance_mm=225.0, focal_px=700.0, distortion=lens
+    )
+    pair = rig_b()
+    volume = np.array([[-400.0] * 3, [400.0] * 3])
+    rig = SyntheticRig("fold", (*pair.cameras, third), volume, 0.05).true_rig()
+    points = seen(pair, xyz_mm)
+    return rig, points + ImagePoints.of(camera="third", point=["0"], xy_px=[xy_third])
+
+
+def test_a_view_beyond_the_lens_is_left_out_and_said():
+    """The other two measure the point; the row says that a view was lost."""
+    xyz = [140.0, 100.0, 60.0]
+    rig, points = beyond_the_fold([1270.0, 1000.0], xyz)
+    assert np.isnan(rig.cameras[2].undistort([[1270.0, 1000.0]])).all()
+    positions = measure_points(rig, points)
+    np.testing.assert_allclose(positions.xyz_mm, [xyz], atol=1e-9)
+    assert positions.cameras.tolist() == [2]
+    assert positions.residual_px[0] < 1e-9
+    assert flags_of(positions) == [Flag.beyond_lens]
+
+
+def test_with_two_cameras_a_view_beyond_the_lens_is_the_reason_why_nothing_is_measured():
+    rig, points = beyond_the_fold([1270.0, 1000.0], [140.0, 100.0, 60.0])
+    positions = measure_points(rig, points.select([1, 2]))
+    assert flags_of(positions) == [Flag.single_view | Flag.beyond_lens]
+    assert np.isnan(positions.xyz_mm).all()
+    assert positions.cameras.tolist() == [1]
+
+
+def test_a_flagged_view_beyond_the_lens_is_not_missed():
+    rig, points = beyond_the_fold([1270.0, 1000.0], [140.0, 100.0, 60.0])
+    flagged = replace(points, flags=np.array([0, 0, int(Flag.blurred)]))
+    assert flags_of(measure_points(rig, flagged)) == [Flag.none]
+
+
+def test_a_used_view_without_a_residual_is_never_silent():
+    """The third sees the point where its lens has an answer; the point lies where it has none."""
+    rig, points = beyond_the_fold([639.5 + 240.0, 511.5 + 200.0], [140.0, 100.0, 60.0])
+    assert np.isfinite(rig.cameras[2].undistort(points.xy_px[2:])).all()
+    positions = measure_points(rig, points)
+    assert np.isnan(positions.residual_px).all()
+    assert positions.cameras.tolist() == [3]
+    assert Flag.not_converged in flags_of(positions)[0]
+
+
+@pytest.mark.parametrize(
+    "unknown",
+    [{"noise_px": np.nan}, {"noise_px": 0.0}, {"parameters": ("left.fx",), "cov": np.nan}],
+    ids=["no noise known", "noise of zero", "no covariance"],
+)
+def test_a_rig_of_unknown_uncertainty_measures_positions_that_are_marked(unknown):
+    scene = rig_b()
+    changes = {"parameter_cov": [[unknown.pop("cov")]]} if "cov" in unknown else {}
+    rig = replace(scene.true_rig(), **unknown, **changes)
+    positions = measure_points(rig, seen(rig, [[5.0, 6, 7], [-5, 0, 9]]))
+    np.testing.assert_allclose(positions.xyz_mm, [[5, 6, 7], [-5, 0, 9]], atol=1e-9)
+    assert np.isnan(positions.cov_mm2).all()
+    assert flags_of(positions) == [Flag.untrusted] * 2
+
+
+def test_tau_is_added_to_what_is_stated_and_to_nothing_else():
+    rig = three_cameras().true_rig()
+    points = seen(rig, np.zeros((1, 3)))
+    variance = 0.01**2
+    some = np.full((3, 2, 2), np.nan)
+    some[0] = variance * np.eye(2)
+    tau = np.sqrt(rig.noise_px**2 - variance)  # the sum is that of the two that state nothing
+    one = measure_points(replace(rig, tau_px=tau), replace(points, cov_px2=some))
+    two = measure_points(rig, points)
+    np.testing.assert_allclose(one.cov_mm2, two.cov_mm2, rtol=1e-12)
+    assert one.dof == rig.dof
+
+
+def test_tau_does_not_count_twice_when_rays_are_compared():
+    """With all of the misfit in tau, a good point is flagged as rarely as without covariances."""
+    rig = replace(three_cameras().true_rig(), tau_px=0.05)
+    points = seen(rig, np.zeros((1, 3)))
+    xy, cov = points.xy_px.copy(), np.broadcast_to(1e-10 * np.eye(2), (3, 2, 2))
+    # the rest of 6 - 3 = 3 squares has its 1e-4 point at 21.1: 0.23 px across the epipolar plane
+    for shift, flag in ((0.2, Flag.none), (0.35, Flag.residual)):
+        xy[2, 1] = points.xy_px[2, 1] + shift
+        positions = measure_points(rig, replace(points, xy_px=xy, cov_px2=cov))
+        assert flags_of(positions) == [flag], shift

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -135,3 +137,25 @@ def test_select():
     assert whole.select(whole.measured).point == ("a", "1")
     assert whole.select([2, 0]).flags.tolist() == [int(Flag.residual | Flag.blurred), 0]
     assert len(whole.select([])) == 0
+
+
+def test_degrees_of_freedom_are_carried(tmp_path):
+    """A 95 % region read from a file is the one that was measured."""
+    replace(positions(), dof=96).to_csv(tmp_path / "p.csv")
+    lines = (tmp_path / "p.csv").read_text().splitlines()
+    assert lines[0] == HEADER.replace("residual_px", "dof,residual_px")
+    assert read_positions(tmp_path / "p.csv").dof == 96
+
+
+ROWS = "placement,point,x_mm,y_mm,z_mm,dof\n,a,1,2,3,{}\n,b,1,2,3,{}\n"
+
+
+@pytest.mark.parametrize(("cells", "dof"), [(("96", "40"), 40), (("96", ""), 96), (("", ""), None)])
+def test_of_different_degrees_of_freedom_the_smallest_counts(read, cells, dof):
+    assert read(ROWS.format(*cells)).dof == dof
+
+
+@pytest.mark.parametrize("cell", ["0", "-3", "1.5", "1e20"])
+def test_impossible_degrees_of_freedom(read, cell):
+    with pytest.raises(TableError, match=r"row 2.*not a number of degrees of freedom"):
+        read(ROWS.format(cell, "9"))

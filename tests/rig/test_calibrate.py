@@ -17,6 +17,7 @@ from closerange.flags import Flag
 from closerange.position.triangulate import triangulate_linear
 from closerange.rig.calibrate import calibrate_rig
 from closerange.rig.camera import Camera
+from closerange.rig.distortion import BrownIdeal
 from closerange.rig.models import FREE, MODELS
 from closerange.rig.weights import common_variance, whitener_of
 from closerange.verification.bound import position_bound, rms_3d_mm
@@ -251,6 +252,67 @@ def test_covariances_weigh():
     assert 0.8 * low < np.sum(squares) < 1.05 * high, np.mean(squares)  # tau^2 >= 0: conservative
 
 
+def test_gaps_in_the_covariances_cost_a_warning_not_the_weights():
+    """One row of 126 without a covariance; half of the points are ten times noisier."""
+    scene = rig_b()
+    table, control = make(scene, 63, 30)
+    std = np.where(np.arange(len(table)) % 2 == 0, 0.5, NOISE_PX)
+    noise = np.random.default_rng(31).normal(0, 1, (len(table), 2))
+    cov = std[:, None, None] ** 2 * np.eye(2)
+    xy = table.xy_px + noise * np.sqrt(std**2 - NOISE_PX**2)[:, None]
+    options = {"model": "brown", "reject": False}
+    stated = replace(table, xy_px=xy, cov_px2=cov)
+    full = calibrate_rig(stated, control, sizes(scene), **options)
+    gaps = cov.copy()
+    gaps[4] = np.nan
+    with pytest.warns(CloseRangeWarning, match="1 of 126 points have no covariance"):
+        rig = calibrate_rig(replace(stated, cov_px2=gaps), control, sizes(scene), **options)
+    assert rig.report["weights"]["points_with_covariance"] == 125
+    ratio = np.sqrt(np.diag(rig.parameter_cov) / np.diag(full.parameter_cov))
+    assert ratio == pytest.approx(1.0, abs=0.03)  # 3 and more without weights
+
+
+def test_a_camera_without_covariances_takes_those_of_the_others():
+    scene = rig_b()
+    table, control = make(scene, 27, 32)
+    cov = np.tile(NOISE_PX**2 * np.eye(2), (len(table), 1, 1))
+    full = calibrate_rig(replace(table, cov_px2=cov), control, sizes(scene), model="brown")
+    cov[[name == "right" for name in table.camera]] = np.nan
+    with pytest.warns(CloseRangeWarning, match="27 of 54 points have no covariance"):
+        rig = calibrate_rig(replace(table, cov_px2=cov), control, sizes(scene), model="brown")
+    assert rig.parameter_cov == pytest.approx(full.parameter_cov, rel=1e-9)
+
+
+@pytest.mark.parametrize("rounding_px", [0.0, 1e-9, 1e-6])
+@pytest.mark.parametrize("count", [27, 63])
+@pytest.mark.parametrize("scene", [rig_a, rig_b], ids=["A", "B"])
+def test_exact_data_are_no_failure(scene, count, rounding_px):
+    """Points without noise, as from a simulation: the search ends and s is not 0."""
+    scene, control = scene(), control_grid(count)
+    table = observe(scene.cameras, control, noise_px=0.0, rng=np.random.default_rng(0))
+    if rounding_px:
+        table = replace(table, xy_px=np.round(table.xy_px / rounding_px) * rounding_px)
+    rig = calibrate_rig(table, control, sizes(scene), model="brown")
+    assert rig.residuals.fitted.all()
+    assert rig.noise_px == 1e-6  # what rounding could hide
+    assert rig.uncertainty_known
+    for entry in rig.report["cameras"].values():
+        assert entry["converged"]
+        assert entry["iterations"] < 30
+    for found, truth in zip(rig.cameras, scene.cameras, strict=True):
+        assert found.centre_mm == pytest.approx(truth.centre_mm, abs=1e-9 + 1e4 * rounding_px)
+
+
+@pytest.mark.parametrize("model", ["pinhole", "brown", "dlt", "thesis-dlt"])
+def test_an_exact_pinhole_is_no_failure(model):
+    cameras = [replace(camera, distortion=BrownIdeal()) for camera in rig_b().cameras]
+    control = control_grid(63)
+    table = observe(cameras, control, noise_px=0.0, rng=np.random.default_rng(0))
+    rig = calibrate_rig(table, control, sizes(rig_b()), model=model)
+    assert rig.noise_px == 1e-6
+    assert all(entry["converged"] for entry in rig.report["cameras"].values())
+
+
 def test_a_common_part_is_found_where_covariances_are_too_small():
     scene = rig_b()
     table, control = make(scene, 125, 10)
@@ -306,6 +368,9 @@ def test_input_is_refused_in_words():
         calibrate_rig(table, control, {"left": (1280, 1024)})
     with pytest.raises(InputError, match="is not below its upper corner"):
         calibrate_rig(table, control, size, volume_mm=[[0, 0, 0], [1, 1, 0]])
+    for volume in ([1, 2, 3], [[0, 0], [1, 1]], np.zeros((3, 2)), [[0, 0, np.nan], [1, 1, 1]], "x"):
+        with pytest.raises(InputError, match="is not two corners of three finite numbers"):
+            calibrate_rig(table, control, size, volume_mm=volume)
     with pytest.raises(InputError, match="model 'tsai' is not known"):
         calibrate_rig(table, control, size, model="tsai")
     with pytest.raises(InputError, match="lie outside of the image"):

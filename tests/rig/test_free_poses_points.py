@@ -160,10 +160,11 @@ def test_points_outside_of_the_image_are_refused():
         calibrate_free_poses(seen(), PLATE, dict.fromkeys(SIZES, (300, 200)))
 
 
+@pytest.mark.filterwarnings("ignore::closerange.errors.CloseRangeWarning")  # half are "outliers"
 def test_covariances_weigh():
     """Every other point is ten times noisier: stated, it costs little and the covariance holds."""
     squares, weighted, plain = [], [], []
-    for seed in range(8):
+    for seed in range(5):
         points = seen(seed=seed)
         noisy = np.arange(len(points)) % 2 == 0
         std = np.where(noisy, 0.5, NOISE_PX)
@@ -177,7 +178,7 @@ def test_covariances_weigh():
         plain.append(errors_of(calibrate_free_poses(unknown, PLATE, SIZES)))
     gain = np.median(np.std(plain, axis=0) / np.std(weighted, axis=0))
     assert gain > 3.0, gain
-    low, high = chi2.ppf([1e-4, 1 - 1e-4], 28 * 8)
+    low, high = chi2.ppf([1e-4, 1 - 1e-4], 28 * 5)
     assert 0.8 * low < np.sum(squares) < 1.05 * high, np.mean(squares)  # tau^2 >= 0: conservative
     assert rig.report["weights"]["points_with_covariance"] == len(points)
 
@@ -193,18 +194,19 @@ def test_gaps_in_the_covariances_cost_a_warning_not_the_weights():
 
 
 def test_errors_of_the_target_are_in_the_covariance():
-    """A print off by 10 um, the same in all placements: the stated covariance holds."""
-    squares, ignoring, runs, std_mm = [], [], 12, 0.01
+    """A print off by 30 um, the same in all placements: the stated covariance holds."""
+    squares, ignoring, runs, std_mm = [], [], 8, 0.03
     for seed in range(runs):
         rng = np.random.default_rng(seed)
         printed = replace(PLATE, xyz_mm=PLATE.xyz_mm + rng.normal(0, std_mm, (25, 3)))
-        points = seen(printed, seed=50 + seed, noise_px=0.02)
+        points = seen(printed, seed=50 + seed)
         stated = replace(PLATE, std_mm=np.full(25, std_mm))
         squares.append(scaled_square(calibrate_free_poses(points, stated, SIZES)))
         ignoring.append(scaled_square(calibrate_free_poses(points, PLATE, SIZES)))
     low, high = chi2.ppf([1e-4, 1 - 1e-4], 28 * runs)
-    assert 0.8 * low < np.sum(squares) < 1.2 * high, f"mean {np.mean(squares):.1f}, expected 28"
-    assert np.mean(ignoring) > 2 * np.mean(squares)
+    # on the safe side: the target's errors count as image noise too
+    assert 0.2 * low < np.sum(squares) < high, f"mean {np.mean(squares):.1f}, 28 if exact"
+    assert np.sum(ignoring) > 1.5 * high, f"mean {np.mean(ignoring):.1f}"
 
 
 def test_disc_centres_are_corrected():

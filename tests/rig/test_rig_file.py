@@ -46,6 +46,7 @@ def make_rig(*, trust: bool = True) -> Rig:
         parameters=parameters,
         parameter_cov=factor @ factor.T * 1e-7,
         noise_px=0.1 + 0.2,
+        tau_px=0.1 / 3,
         dof=2,
         model="brown",
         residuals=Residuals(
@@ -131,6 +132,7 @@ def test_a_bare_rig_round_trips(tmp_path):
         residuals=Residuals(
             (), (), (), np.empty((0, 3)), np.empty((0, 2)), np.empty((0, 2)), [], []
         ),
+        trust=Trust("untrustworthy", [np.nan] * 3, [np.nan] * 3, ("nothing is known",)),
     )
     write_rig(bare, tmp_path / "a.json")
     assert_same(bare, read_rig(tmp_path / "a.json"))
@@ -139,7 +141,7 @@ def test_a_bare_rig_round_trips(tmp_path):
 def test_a_person_can_read_it(tmp_path):
     write_rig(make_rig(), tmp_path / "a.json")
     lines = (tmp_path / "a.json").read_text(encoding="utf-8").splitlines()
-    assert lines[1] == ' "schema": "closerange.rig/1",'
+    assert lines[1] == ' "schema": "closerange.rig/2",'
     assert '  "predicted_mm": [0.004, null, "infinite"],' in lines
     row = next(line for line in lines if '"z 1", "01"' in line)  # one residual, one line
     assert row.rstrip(",").endswith('true, "blurred|outlier"]')
@@ -201,7 +203,7 @@ MIRRORED = [[1, 0, 0], [0, 1, 0], [0, 0, -1]]
 BROKEN = {
     "other schema": (("schema",), "closerange.target/1", "not a rig file"),
     "no schema": (("schema",), ..., "not a rig file: schema nothing"),
-    "later version": (("schema",), "closerange.rig/2", "this program reads 'closerange.rig/1'"),
+    "later version": (("schema",), "closerange.rig/3", "reads 'closerange.rig/2' and 'closera"),
     "missing key": (("noise_px",), ..., "missing key 'noise_px'"),
     "missing lens": (("cameras", 1, "distortion"), ..., r"cameras\[1\]'.*missing key 'distortion'"),
     "unknown key": (("cameras", 0, "distortion", "k4"), 0.1, r"cameras\[0\].distortion.*'k4'"),
@@ -230,6 +232,13 @@ BROKEN = {
     "true as number": (("noise_px",), True, "expected a number, found True"),
     "endless integer": (("noise_px",), 10**400, "integer of 1329 bits is not finite"),
     "negative noise": (("noise_px",), -0.1, "negative"),
+    "no noise": (("noise_px",), 0, "no image is free of noise"),
+    "unknown noise": (("noise_px",), None, "nothing would say so"),
+    "unknown covariance": (("parameter_cov",), [[None] * 6] * 6, "nothing would say so"),
+    "unknown freedom": (("dof",), 0, "nothing would say so"),
+    "negative tau": (("tau_px",), -0.1, "negative"),
+    "unknown tau": (("tau_px",), None, "expected a number, found nothing"),
+    "tau in version 1": (("schema",), "closerange.rig/1", "unknown key 'tau_px'"),
     "size": (("cameras", 0, "size_px"), [1280, 0], "0 is not within 1"),
     "fraction of a pixel": (("cameras", 0, "size_px"), [1280.5, 10], "expected a whole number"),
     "three sizes": (("cameras", 0, "size_px"), [1280, 10, 3], "3 entries, expected 2"),
@@ -258,6 +267,7 @@ BROKEN = {
 def test_broken_files_are_refused_with_file_key_and_remedy(tmp_path, name):
     steps, value, message = BROKEN[name]
     document = copy.deepcopy(rig_to_document(make_rig()))
+    document["trust"]["verdict"] = "fair"
     changed(*steps, value=value)(document)
     path = tmp_path / "broken.json"
     path.write_text(json.dumps(document), encoding="utf-8")
@@ -268,10 +278,27 @@ def test_broken_files_are_refused_with_file_key_and_remedy(tmp_path, name):
     assert caught.value.exit_code == 2
 
 
-def test_unknown_covariance_entries_in_pairs_are_read_as_nan():
+def test_unknown_covariance_of_an_untrustworthy_rig_is_read_as_nan_in_pairs():
     document = rig_to_document(make_rig())
     document["parameter_cov"] = [[None] * 6 for _ in range(6)]
-    assert np.isnan(rig_from_document(document).parameter_cov).all()
+    document["trust"]["verdict"] = "untrustworthy"
+    rig = rig_from_document(document)
+    assert np.isnan(rig.parameter_cov).all()
+    assert not rig.trusted
+    document["trust"] = None  # nothing would mark what is measured with it
+    with pytest.raises(SchemaError, match="nothing would say so"):
+        rig_from_document(document)
+
+
+def test_a_file_of_version_1_is_read_without_what_covariances_leave_out():
+    document = rig_to_document(make_rig())
+    assert document["tau_px"] == 0.1 / 3
+    old = {key: value for key, value in document.items() if key != "tau_px"}
+    rig = rig_from_document({**old, "schema": "closerange.rig/1"})
+    assert rig.tau_px == 0.0
+    assert_same(rig, rig_from_document(rig_to_document(rig)))  # written as version 2
+    with pytest.raises(SchemaError, match="missing key 'tau_px'"):
+        rig_from_document(old)
 
 
 @pytest.mark.parametrize("text", ["[]", "3", "null", '"closerange.rig/1"', "{}"])

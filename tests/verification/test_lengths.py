@@ -62,10 +62,13 @@ def test_prediction_holds_for_independent_ends():
 
 def test_flagged_ends_are_listed_and_not_averaged():
     flags = [0, 0, int(Flag.residual), 0]
-    check = length_test(
-        bars([[[0, 0, 0], [5.1, 0, 0]], [[0, 0, 0], [90, 0, 0]]], flags=flags),
-        Lengths.of("a", "b", [5.0]),
-    )
+    with pytest.warns(UserWarning, match="1 of 2 lengths have a flagged end"):
+        check = length_test(
+            bars([[[0, 0, 0], [5.1, 0, 0]], [[0, 0, 0], [90, 0, 0]]], flags=flags),
+            Lengths.of("a", "b", [5.0]),
+        )
+    assert check.reservations == ("1 of 2 lengths have a flagged end and were left out",)
+    assert check.hollow == ""  # half of them count
     assert check.used.tolist() == [True, False]
     assert check.max_mm == pytest.approx(0.1)
     assert check.to_document()["rows"]["flags"] == ["", "residual"]
@@ -76,6 +79,7 @@ def test_unmeasured_lengths_are_listed():
     with pytest.warns(UserWarning, match="1 of 2 lengths were not measured"):
         check = length_test(positions, Lengths.of(["a", "a"], ["b", "c"], [5.0, 7.0]))
     assert check.missing == (("", "a", "c"),)
+    assert check.to_document()["reservations"] == ["1 of 2 lengths were not measured"]
     with pytest.raises(DataError, match="none of 1 lengths"):
         length_test(positions, Lengths.of(["x"], ["y"], [1.0]))
 

@@ -10,8 +10,8 @@ import pytest
 from closerange.errors import SchemaError
 from closerange.features.control import ControlPoints
 from closerange.position.positions import Positions
-from closerange.verification.judgement import Limits
 from closerange.verification.control_check import compare_with_control
+from closerange.verification.judgement import Limits
 from closerange.verification.lengths import Lengths, length_test
 from closerange.verification.result_file import plain, read_result, write_result
 from closerange.verification.single_point import single_point_test

@@ -121,6 +121,9 @@ def test_one_camera_alone_is_judged_without_a_figure():
     trust = judge_rig(alone)
     assert trust.verdict == "fair"
     assert np.isnan(trust.predicted_mm).all()
+    assert trust.reasons[0].startswith("one camera: no positions")
+    assert not any("seen by fewer than two" in reason for reason in trust.reasons)
+    assert str(trust) == "fair: no positions, hence no predicted error"
 
 
 def test_an_infinite_covariance_is_not_trusted():
@@ -130,3 +133,18 @@ def test_an_infinite_covariance_is_not_trusted():
     trust = judge_rig(replace(rig, parameter_cov=cov))
     assert trust.verdict == "untrustworthy"
     assert "not finite" in trust.reasons[0]
+
+
+@pytest.mark.parametrize("noise_px", [0.05, 0.0])
+def test_two_cameras_with_the_same_points_are_not_trusted(noise_px):
+    """One camera's table under two names: the rays never cross, nothing can be predicted."""
+    scene, control = rig_b(), control_grid(27)
+    rng = np.random.default_rng(0)
+    left = observe(scene.cameras[:1], control, noise_px=noise_px, rng=rng)
+    both = left + replace(left, camera=("right",) * len(left))
+    sizes = {camera.name: camera.size_px for camera in scene.cameras}
+    trust = judge_rig(calibrate_rig(both, control, sizes, model="brown"))
+    assert trust.verdict == "untrustworthy"
+    assert "images of one camera under several names" in trust.reasons[0]
+    assert not any("seen by fewer than two" in reason for reason in trust.reasons)
+    assert "nan" not in str(trust)

@@ -33,6 +33,10 @@ GAP_RAD = np.deg2rad(10.0)
 """Gap between the directions in which edge points lie, seen from the corner, that parts two arms:
 an arm without gaps of its own spans less from one point to the next."""
 
+SHARPEST_RAD = np.deg2rad(20.0)
+"""Least angle between two arms of a corner: the intersection of lines that meet at less is three
+times as uncertain as they are."""
+
 TURN_RAD = np.deg2rad(40.0)
 """Least angle by which an edge turns at a corner. Where it turns by less, it may be a circle of
 18 px radius or more; the arms of a smaller one are not straight."""
@@ -98,6 +102,7 @@ class _Arm:
     point: IntArray
     normal: FloatArray
     middle: FloatArray
+    outward: FloatArray
     std_px: float  # of the line, across itself, at the corner
 
 
@@ -164,9 +169,9 @@ def _corner(
 def _meeting(arms: list[_Arm]) -> tuple[FloatArray, FloatArray, list[_Arm]] | None:
     """Intersect arms; leave out those that miss the place where the others meet."""
     while len(arms) >= 2:
-        normals = np.array([arm.normal for arm in arms])
-        if _largest_sine(normals) < np.sin(TURN_RAD):
+        if not _turn(arms):
             return None
+        normals = np.array([arm.normal for arm in arms])
         weight = np.array([arm.std_px**-2 for arm in arms])
         offset = np.array([arm.normal @ arm.middle for arm in arms])
         cov = np.linalg.inv(np.einsum("k,ki,kj->ij", weight, normals, normals))
@@ -181,9 +186,9 @@ def _meeting(arms: list[_Arm]) -> tuple[FloatArray, FloatArray, list[_Arm]] | No
 
 def _misfit(arms: list[_Arm]) -> float:
     """Return the weighted sum of squares by which arms miss each other; infinite without angle."""
-    normals = np.array([arm.normal for arm in arms])
-    if len(arms) < 2 or _largest_sine(normals) < np.sin(TURN_RAD):
+    if not _turn(arms):
         return np.inf
+    normals = np.array([arm.normal for arm in arms])
     weight = np.array([arm.std_px**-2 for arm in arms])
     offset = np.array([arm.normal @ arm.middle for arm in arms])
     matrix = normals * np.sqrt(weight)[:, None]
@@ -242,13 +247,17 @@ def _arm(edges: EdgePoints, point: IntArray, place: FloatArray) -> _Arm | None:
         return None
     lever = float((place - middle) @ axes[0]) ** 2 / spread
     variance = max(noise, scatter) * (1 / len(point) + lever) + model
-    return _Arm(point, axes[1], middle, float(np.sqrt(variance)))
+    outward = middle - place
+    outward = outward / np.linalg.norm(outward)
+    return _Arm(point, axes[1], middle, outward, float(np.sqrt(variance)))
 
 
-def _largest_sine(normals: FloatArray) -> float:
-    """Return the sine of the angle between the two most different lines."""
-    cross = normals[:, None, 0] * normals[None, :, 1] - normals[:, None, 1] * normals[None, :, 0]
-    return float(np.abs(cross).max())
+def _turn(arms: list[_Arm]) -> bool:
+    """Tell whether two of the arms form an angle, neither too sharp nor nearly straight."""
+    outward = np.array([arm.outward for arm in arms]).reshape(-1, 2)
+    cosine = outward @ outward.T
+    sharpest, bluntest = np.cos(SHARPEST_RAD), -np.cos(TURN_RAD)
+    return bool(((cosine < sharpest) & (cosine > bluntest)).any())
 
 
 def _distinct(

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from closerange.features.disc_band import Band, Crop
+from closerange.features.disc_band import BAND_BLURS, Band, Crop
 from closerange.features.disc_model import (
     BACKGROUND,
     CONTRAST,
@@ -51,8 +51,10 @@ class DiscFit:
         Standard deviation of a pixel from differences of neighbours, root mean square of
         inside and outside.
     reduced_residual : float
-        Root mean square residual divided by the noise, of outside, edge or inside where it is
-        largest; near 1 where the model holds.
+        Root mean square residual divided by the noise, of outside, edge or inside where noise
+        explains it least; near 1 where the model holds.
+    misfit : float
+        The same residual as a share of the contrast.
     converged : bool
         Whether the last pass reached its minimum.
     """
@@ -65,6 +67,7 @@ class DiscFit:
     contrast: float
     noise: float
     reduced_residual: float
+    misfit: float
     converged: bool
 
 
@@ -131,10 +134,12 @@ def fit_disc(
 
 
 def _moved(before: FloatArray, after: FloatArray) -> bool:
-    """Whether the band of `before` was misplaced by half a pixel, or its width by 15 %."""
+    """Whether the band of `before` was misplaced by half a pixel, or its width by that and 15 %."""
     size = [np.array(axes_of_shape(*x[2:5])[:2]) for x in (before, after)]
     shifts = np.append(after[:2] - before[:2], size[1] - size[0])
-    return bool((np.abs(shifts) > 0.5).any() or abs(blur_px(after) / blur_px(before) - 1) > 0.15)
+    blurs = blur_px(before), blur_px(after)
+    wider = abs(blurs[1] - blurs[0])
+    return bool((np.abs(shifts) > 0.5).any() or wider > max(0.15 * blurs[0], 0.5 / BAND_BLURS))
 
 
 def _result(fit: LeastSquaresFit, band: Band, origin: FloatArray, *, settled: bool) -> DiscFit:
@@ -148,13 +153,14 @@ def _result(fit: LeastSquaresFit, band: Band, origin: FloatArray, *, settled: bo
         blur_px=blur_px(fit.x),
         contrast=float(fit.x[CONTRAST]),
         noise=noise,
-        reduced_residual=misfit,
+        reduced_residual=misfit.by_noise,
+        misfit=misfit.by_contrast,
         converged=fit.converged and settled,
     )
 
 
 _NAN2 = np.full((2, 2), np.nan)
 NOT_MEASURED = DiscFit(
-    _NAN2[0], _NAN2, _NAN2, (np.nan,) * 3, np.nan, np.nan, np.nan, np.nan, converged=False
+    _NAN2[0], _NAN2, _NAN2, (np.nan,) * 3, np.nan, np.nan, np.nan, np.nan, np.nan, converged=False
 )
 """The answer where there is nothing to fit."""

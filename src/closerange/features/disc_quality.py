@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 
 from closerange.features.disc_band import (
@@ -11,7 +13,7 @@ from closerange.features.disc_band import (
     QUANTISATION_DN2,
     Band,
 )
-from closerange.features.disc_model import blur_px, density, outline_of
+from closerange.features.disc_model import CONTRAST, blur_px, density, outline_of
 from closerange.geometry.arrays import BoolArray, FloatArray, IntArray
 from closerange.geometry.ellipse import axes_of_shape
 from closerange.geometry.least_squares import LeastSquaresFit
@@ -21,8 +23,21 @@ from closerange.geometry.least_squares import LeastSquaresFit
 ROUGHNESS_WAVE_PX, ROUGHNESS_DOF = 6.0, 8
 
 
-def noise_and_misfit(fit: LeastSquaresFit, band: Band) -> tuple[float, float]:
-    """Return the noise of a pixel and the largest misfit of a zone in units of it.
+@dataclass(frozen=True, slots=True)
+class Misfit:
+    """Root mean square residual where the model holds worst: outside, along the edge or inside."""
+
+    by_noise: float
+    by_contrast: float
+
+    @property
+    def beyond_noise(self) -> float:
+        """What noise does not explain, as a share of the contrast."""
+        return self.by_contrast * float(np.sqrt(max(1 - self.by_noise**-2, 0.0)))
+
+
+def noise_and_misfit(fit: LeastSquaresFit, band: Band) -> tuple[float, Misfit]:
+    """Return the noise of a pixel, and the residuals of the zone that noise explains least.
 
     The weights learn from residuals, so they take a ghost, a stain or a wrong shape for noise.
     But those change little from pixel to pixel: the differences of neighbours show the noise.
@@ -31,12 +46,23 @@ def noise_and_misfit(fit: LeastSquaresFit, band: Band) -> tuple[float, float]:
     outside, inside = band.inside < FLAT_SHARE, band.inside > 1 - FLAT_SHARE
     typical = [_from_neighbours(fit, band, kept & zone) for zone in (outside, inside)]
     scale = typical[0] + (typical[1] - typical[0]) * band.inside
-    squares = (fit.residuals[:-1] / scale) ** 2
-    zones = [squares[kept & zone] for zone in (outside, inside, ~outside & ~inside)]
-    misfit = max((float(zone.mean()) for zone in zones if zone.size >= FLAT_PIXELS), default=1.0)
     variances = np.array(band.variances_after(fit)) * np.square(typical)
     noise = np.sqrt(max(float(variances.mean()), QUANTISATION_DN2))
-    return float(noise), float(np.sqrt(factor * misfit))
+    by_noise = factor * (fit.residuals[:-1] / scale) ** 2
+    contrast = max(abs(fit.x[CONTRAST]), float(np.sqrt(QUANTISATION_DN2)))  # flat images have none
+    by_contrast = factor * (fit.residuals[:-1] * band.std / contrast) ** 2
+    flat = [kept & side for side in (outside, inside) if _enough(kept & side)]
+    edge = kept & ~np.any([~kept, *flat], axis=0)  # of a small disc all that is not background
+    found = [
+        Misfit(float(np.sqrt(by_noise[zone].mean())), float(np.sqrt(by_contrast[zone].mean())))
+        for zone in (*flat, edge)
+        if _enough(zone)
+    ]
+    return float(noise), max(found, key=lambda m: m.beyond_noise, default=Misfit(1.0, 0.0))
+
+
+def _enough(zone: BoolArray) -> bool:
+    return bool(np.count_nonzero(zone) >= FLAT_PIXELS)
 
 
 def _from_neighbours(fit: LeastSquaresFit, band: Band, zone: BoolArray) -> float:

@@ -30,8 +30,11 @@ BLURRED_SHARE = 0.5
 # Below five times the noise a pixel of the disc can be mistaken for background.
 LOW_CONTRAST_SIGMAS = 5.0
 # Residuals beyond twice the pixel-to-pixel noise AND 3 % of the contrast. Correlated noise (of
-# demosaicing or compression) reaches 1.5; an image of little noise shows gamma, at 1 to 2 %,
-# which is symmetric and leaves the centre alone.
+# demosaicing or compression) reaches 1.5. A grey level that is wrong by that share on one side
+# moves the edge there by share x blur x sqrt(2 pi), the centre by half of it: 0.03 px in a lens in
+# focus. An image of little noise shows what a Gaussian edge is not, up to 2 %: gamma, the square
+# pixel under a sharp lens, the flat disc of a defocused one. That is the same on both sides of the
+# disc and leaves the centre alone; a ghost, a stain or another shape leaves 5 % and more.
 POOR_FIT_SIGMAS, POOR_FIT_SHARE = 2.0, 0.03
 # A centre that ran away from its blob by half its radius (a pixel at least) is another thing's.
 LOST_SHARE, LOST_PX = 0.5, 1.0
@@ -204,7 +207,9 @@ def _least_squares(
         return fit
     # rounding moves a border more than an area: its covariance is on the safe side
     rough = _border_centroid(found, candidate, sign)
-    return replace(rough, xy_px=start.centre, reduced_residual=np.inf, converged=False)
+    return replace(
+        rough, xy_px=start.centre, reduced_residual=np.inf, misfit=np.inf, converged=False
+    )
 
 
 def _border_centroid(found: DiscCandidates, candidate: Candidate, sign: float) -> DiscFit:
@@ -218,6 +223,7 @@ def _border_centroid(found: DiscCandidates, candidate: Candidate, sign: float) -
         contrast=sign * candidate.contrast,
         noise=found.noise,
         reduced_residual=np.nan,
+        misfit=np.nan,
         converged=True,
     )
 
@@ -230,8 +236,7 @@ def _flags(frame: Frame, candidate: Candidate, fit: DiscFit, full_scale: float) 
         Flag.saturated: _saturated_share(frame, fit, full_scale) > SATURATED_SHARE,
         Flag.blurred: fit.blur_px > BLURRED_SHARE * fit.ellipse[1],
         Flag.low_contrast: contrast < LOW_CONTRAST_SIGMAS * fit.noise,
-        Flag.poor_fit: residual > POOR_FIT_SIGMAS
-        and residual * fit.noise > POOR_FIT_SHARE * contrast,
+        Flag.poor_fit: residual > POOR_FIT_SIGMAS and fit.misfit > POOR_FIT_SHARE,
         Flag.not_converged: not fit.converged,
     }
     flag = Flag.none

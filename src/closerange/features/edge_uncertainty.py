@@ -50,9 +50,7 @@ def model_std(
     strong = strength >= np.median(strength)
     sharpest = np.quantile(width[strong], 0.1)
     excess = np.maximum(width - sharpest, 0.0)
-    return np.asarray(
-        np.sqrt(FLOOR_PX**2 + DRIFT_SHARE**2 * drift2 + WIDTH_SHARE**2 * excess)
-    )
+    return np.asarray(np.sqrt(FLOOR_PX**2 + DRIFT_SHARE**2 * drift2 + WIDTH_SHARE**2 * excess))
 
 
 def chain_mean(value: FloatArray, after: IntArray) -> FloatArray:

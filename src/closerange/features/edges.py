@@ -87,7 +87,9 @@ class EdgePoints:
 
     def select(self, rows: ArrayLike) -> EdgePoints:
         """Keep some points and link them anew."""
-        kept = np.arange(len(self))[np.asarray(rows)]
+        chosen = np.asarray(rows)
+        # [] has a float's type
+        kept = np.arange(len(self))[chosen if chosen.size else slice(0)]
         after, before = link_edges(self.xy_px[kept], self.normal[kept], self.size_px)
         return EdgePoints(
             self.xy_px[kept],
@@ -220,7 +222,9 @@ def _peak(
     return xy_px, here, here / curvature
 
 
-def _vertex(below: FloatArray, here: FloatArray, above: FloatArray) -> tuple[FloatArray, FloatArray]:
+def _vertex(
+    below: FloatArray, here: FloatArray, above: FloatArray
+) -> tuple[FloatArray, FloatArray]:
     curvature = np.maximum(2 * here - below - above, 1e-3 * np.abs(here) + 1e-12)
     return 0.5 * (above - below) / curvature, curvature
 

@@ -20,8 +20,8 @@ LARGEST_DAMPING = 1e12
 # The first ends the search; where residuals are large and parameters hang together, each step
 # gains only a little less than the one before, and the second is good enough when steps run out.
 GAIN_LIMIT, GAIN_ENOUGH = 1e-12, 1e-7
-# A step that gains three quarters of what the linear model promised may be longer the next time, one
-# that gains less than a quarter must be shorter (the usual limits, doi:10.1007/BFb0067700).
+# A step that gains three quarters of what the linear model promised may be longer the next time,
+# one that gains less than a quarter must be shorter (the usual limits, doi:10.1007/BFb0067700).
 KEPT_PROMISE = 0.75
 # A residual is the difference of two numbers that a few operations have rounded: exact data leave
 # a cost of this share of the numbers' squares, in which no step finds a way down.

@@ -9,6 +9,7 @@ and single frames for being blank or interlaced.
 
 from closerange.images.checks import (
     check_frame,
+    check_interlace,
     comb_share,
     noise_level,
     saturated_share,
@@ -43,6 +44,7 @@ __all__ = [
     "check_duplicates",
     "check_exposures",
     "check_frame",
+    "check_interlace",
     "check_sizes",
     "comb_share",
     "distinct",

@@ -68,6 +68,28 @@ def check_frame(frame: Frame) -> list[str]:
             f"{noise:.2g}); mean {frame.pixels.mean():.1f} of {frame.full_scale}",
             remedy="check lens cap, exposure, lighting and that the target is in view",
         )
+    return check_interlace(frame)
+
+
+def check_interlace(frame: Frame) -> list[str]:
+    """Warn of an image that is made of two fields taken at different moments.
+
+    Parameters
+    ----------
+    frame : Frame
+        The image.
+
+    Returns
+    -------
+    list of str
+        The warnings that were also given, for a report.
+
+    Warns
+    -----
+    CloseRangeWarning
+        If it is.
+    """
+    where = f"{frame.source or 'frame'} (camera {frame.camera!r})"
     notes = []
     if (share := comb_share(frame)) > COMB_SHARE:
         notes.append(

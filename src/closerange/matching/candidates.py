@@ -69,7 +69,9 @@ class Candidates:
 
     def select(self, rows: ArrayLike) -> Candidates:
         """Keep or reorder rows."""
-        kept = np.asarray(rows)
+        chosen = np.asarray(rows)
+        # [] has a float's type
+        kept = np.arange(len(self))[chosen if chosen.size else slice(0)]
         return Candidates(*(getattr(self, item.name)[kept] for item in fields(self)))
 
 

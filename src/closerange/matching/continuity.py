@@ -57,12 +57,15 @@ class Choice:
         Cost in px by which the best other height is worse; infinite without another.
     cost : ndarray, shape (N,)
         Unary cost of the best one, px of misfit.
+    lead : ndarray, shape (N,)
+        Unary cost of the cheapest other height, less that; infinite without another.
     """
 
     candidate: IntArray
     matched: np.ndarray[tuple[int], np.dtype[np.bool_]]
     margin: FloatArray
     cost: FloatArray
+    lead: FloatArray
 
 
 def choose(first: EdgePoints, candidates: Candidates, cost: FloatArray, axis: int) -> Choice:
@@ -97,12 +100,14 @@ def choose(first: EdgePoints, candidates: Candidates, cost: FloatArray, axis: in
     away = np.abs(grid.height - grid.height[rows, best][:, None]) * grid.px_per_mm
     other = np.where(away > STEP_LIMIT / 2, belief[:, :-1], np.inf).min(axis=1, initial=np.inf)
     other = np.where(other >= NEVER / 2, np.inf, other)
+    rival = np.where(away > STEP_LIMIT / 2, grid.unary[:, :-1], np.inf).min(axis=1, initial=np.inf)
     chosen = grid.row[rows, best]
     return Choice(
         candidate=chosen,
         matched=(chosen >= 0) & (lowest < belief[:, -1]),
         margin=np.asarray(other - lowest, dtype=np.float64),
         cost=np.where(chosen >= 0, grid.unary[rows, best], np.nan).astype(np.float64),
+        lead=np.asarray(rival - grid.unary[rows, best], dtype=np.float64),
     )
 
 

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from closerange.features.edge_chains import chain_window
 from closerange.features.edges import EdgePoints
 from closerange.features.edge_uncertainty import chain_mean
 from closerange.flags import Flag
@@ -17,6 +18,7 @@ from closerange.geometry.arrays import BoolArray, FloatArray, IntArray
 from closerange.matching.candidates import SHALLOWEST, Candidates, find_candidates, sweep_axis
 from closerange.matching.chain_fit import fit_chains
 from closerange.matching.continuity import Choice, choose
+from closerange.matching.depth_table import MISFIT_LIMIT_PX
 from closerange.matching.evidence import unary_cost
 from closerange.matching.pencil import Pencil
 from closerange.rig.camera import Camera
@@ -27,6 +29,15 @@ chain, each of which may be off by half a pixel."""
 
 MARGIN_PX = 1.0
 """Cost by which the best other place must be worse: one pixel of misfit."""
+
+TIE_PX = 0.5
+"""Lead of the chosen place over the best other one, by the images alone, in px of misfit and in the
+mean along the chain, below which the choice is a matter of chance: half a pixel is what noise and
+sampling leave. The margin cannot tell: it sums along the chain what was chance at every point, so
+that of equal stripes one wins clearly."""
+
+TIE_REACH = 10
+"""Points of the chain on each side over which that lead is averaged."""
 
 STRAY = 3.0
 """Residual against the smoothed chain, in standard deviations, that is not chance."""
@@ -162,7 +173,9 @@ def _smoothed(
         np.hypot(part[0] * along_first, part[1] / chosen.sine)
         for part in (noise, [np.hypot(a, b) for a, b in zip(model, merged, strict=True)])
     )
-    std, common, value, sine, rate = (np.full(count, np.nan) for _ in range(5))
+    std, value, sine = (np.full(count, np.nan) for _ in range(3))
+    # a point without a candidate stands between its neighbours, with the usual share of theirs
+    common, rate = (np.full(count, np.median(usual)) for usual in (model * to_px, pace))
     std[rows], common[rows] = np.hypot(noise, model) * to_px, model * to_px
     value[rows], sine[rows] = chosen.xyz_mm[:, axis] * px_per_mm, chosen.sine
     rate[rows] = pace
@@ -238,6 +251,7 @@ def _judged(
             (Flag.occluded, (choice.candidate >= 0) & ~choice.matched),
             (Flag.inconsistent, choice.matched & ~_returns(sides, edges[1], smooth, axis)),
             (Flag.ambiguous, choice.matched & (choice.margin < MARGIN_PX)),
+            (Flag.ambiguous, choice.matched & _tied(edges[0], choice)),
             (Flag.residual, np.abs(smooth.residual) > STRAY),
             (Flag.aperture, unsure & (smooth.sine < SHALLOW_SINE)),
             (Flag.poor_fit, unsure & (smooth.sine >= SHALLOW_SINE)),
@@ -252,6 +266,16 @@ def _judged(
         choice.cost,
         flags,
     )
+
+
+def _tied(first: EdgePoints, choice: Choice) -> BoolArray:
+    """Mark the points around which another place fits the images about as well."""
+    window = chain_window(first.after, first.before, TIE_REACH)
+    # more than the limit of misfit says no more
+    lead = np.clip(choice.lead, -MISFIT_LIMIT_PX, MISFIT_LIMIT_PX)
+    there = (window >= 0) & choice.matched[window]
+    total = np.where(there, lead[window], 0.0).sum(axis=1)
+    return np.asarray(total < TIE_PX * there.sum(axis=1))
 
 
 def on_rays(pencil: Pencil, xy_px: FloatArray, height_mm: FloatArray, axis: int) -> FloatArray:

@@ -9,7 +9,6 @@ reference for comparison: `closerange.matching` has better matchers.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, fields
 from typing import Any
 
 import numpy as np
@@ -19,15 +18,7 @@ from closerange.errors import InputError
 from closerange.features.edge_operators import edge_mask
 from closerange.features.threshold import threshold_report
 from closerange.flags import Flag
-from closerange.geometry.arrays import (
-    BoolArray,
-    FloatArray,
-    IntArray,
-    all_finite,
-    frozen_array,
-    frozen_ints,
-)
-from closerange.matching.correspondences import Correspondences
+from closerange.geometry.arrays import BoolArray, FloatArray, all_finite
 from closerange.matching.literal_band import Bands, bands
 from closerange.matching.literal_element import (
     EdgePixels,
@@ -36,6 +27,7 @@ from closerange.matching.literal_element import (
     farthest_plane,
     footprint,
 )
+from closerange.matching.literal_matches import LiteralMatches, join_matches
 from closerange.matching.literal_scan import Chosen, Hits, PackedImage, choose_places
 from closerange.matching.search import checked_volume, inside_image
 from closerange.rig.camera import Camera
@@ -47,80 +39,6 @@ BAND_PX = 0.5
 
 _PIECE = 8192
 """Points whose places are listed at once: 60 MB for segments of 500 px."""
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class LiteralMatches:
-    """Matches of N points.
-
-    Attributes
-    ----------
-    seed_px : ndarray, shape (N, 2)
-        Points of view 1.
-    xy_px : ndarray, shape (N, 2)
-        Matches in view 2, whole pixels; NaN without one.
-    mismatch : ndarray, shape (N,)
-        Pixels of the element that are missing in image 2; NaN without a match.
-    pixels : ndarray of int, shape (N,)
-        Pixels of the element in view 2.
-    ties : ndarray of int, shape (N,)
-        Places at which as few are missing, the chosen one included.
-    flags : ndarray of int, shape (N,)
-        `Flag` bits of each match. `ambiguous`: an equally good place is farther than a pixel's
-        neighbours. `at_border`: the element is cut by the border of either image. Without a
-        match: `no_edge` (the element has no pixel, or none of it is anywhere in the
-        neighbourhood), `outside_image` (the point, the segment or an oversized element),
-        `not_found` (no point), and those of `EpipolarSegments`.
-    """
-
-    seed_px: FloatArray
-    xy_px: FloatArray
-    mismatch: FloatArray
-    pixels: IntArray
-    ties: IntArray
-    flags: IntArray
-
-    def __post_init__(self) -> None:
-        count = len(self.flags)
-        for name in ("seed_px", "xy_px"):
-            object.__setattr__(self, name, frozen_array(getattr(self, name), (count, 2), name))
-        object.__setattr__(self, "mismatch", frozen_array(self.mismatch, (count,), "mismatch"))
-        for name in ("pixels", "ties", "flags"):
-            object.__setattr__(self, name, frozen_ints(getattr(self, name), (count,), name))
-
-    def __len__(self) -> int:
-        return len(self.flags)
-
-    def to_correspondences(
-        self, cameras: Sequence[str], point: Sequence[str], placement: str = ""
-    ) -> Correspondences:
-        """Return the matches as rows of a matches table.
-
-        Parameters
-        ----------
-        cameras : sequence of str
-            Names of view 1 and view 2.
-        point : sequence of str
-            Names of the N points.
-        placement : str, optional
-            Name of the placement.
-
-        Returns
-        -------
-        Correspondences
-            `mismatch` is the count; covariances are unknown: the method states none.
-        """
-        first, second = cameras
-        missing = ~all_finite(self.seed_px, 1)
-        seed_flags = np.where(missing, int(Flag.not_found), 0)
-        return Correspondences.of(
-            cameras=(first, second),
-            point=point,
-            placement=placement,
-            xy_px=np.stack([self.seed_px, self.xy_px], axis=1),
-            mismatch=self.mismatch,
-            flags=np.column_stack([seed_flags, self.flags]),
-        )
 
 
 def binary_images(
@@ -227,6 +145,7 @@ class LiteralMatcher:
             If the element is larger than image 1.
         """
         seeds = np.reshape(np.asarray(xy_px, np.float64), (-1, 2))
+        seeds = np.where(np.isfinite(seeds), seeds, np.nan)
         step = 1 if whole_image else _PIECE
         found = []
         for first in range(0, len(seeds), step):
@@ -234,7 +153,7 @@ class LiteralMatcher:
             found.append(self._piece(piece, inside, whole_image=whole_image))
             if progress is not None:
                 progress(first + len(piece), len(seeds))
-        return _joined(found)
+        return join_matches(found)
 
     def bands(self, xy_px: FloatArray) -> Bands:
         """Return the neighbourhoods of points, shape (M, 2)."""
@@ -272,27 +191,31 @@ class LiteralMatcher:
         """Count the pixels of elements that are present at each place; see `PackedImage.scan`."""
         return self._image.scan(elements, places)
 
-    def _piece(
-        self, seeds: FloatArray, inside: BoolArray, *, whole_image: bool
-    ) -> LiteralMatches:
-        elements = self.elements(seeds, inside)
-        if whole_image:
-            places = _everywhere(self.cameras[1], inside_image(self.cameras[0], seeds))
-            hits = np.stack(
-                [self._image.scan_all(elements, row).ravel() for row in range(len(seeds))]
-            )
-        else:
-            places = self.bands(seeds)
-            hits = self.scan(elements, places)
-        return self._decided(seeds, inside, (elements, places), choose_places(hits, places))
-
-    def _decided(
+    def decided(
         self,
         seeds: FloatArray,
-        inside: BoolArray,
+        size_px: int,
         searched: tuple[MappedElements, Bands],
         chosen: Chosen,
     ) -> LiteralMatches:
+        """Turn chosen places into matches with their flags.
+
+        Parameters
+        ----------
+        seeds : ndarray, shape (M, 2)
+            Points.
+        size_px : int
+            N of the elements.
+        searched : tuple of MappedElements and Bands
+            Elements and neighbourhoods, from `elements` and `bands`.
+        chosen : Chosen
+            Of `choose_places` after `scan`.
+
+        Returns
+        -------
+        LiteralMatches
+            M points.
+        """
         elements, places = searched
         flags = places.flags.copy()
         there = inside_image(self.cameras[0], seeds)
@@ -303,11 +226,9 @@ class LiteralMatcher:
         flags[~barred & (chosen.hits == 0)] |= int(Flag.no_edge)
         found = ~barred & (chosen.hits > 0)
         rows = np.arange(len(seeds))
-        at = np.column_stack(
-            [places.column[rows, chosen.place], places.row[rows, chosen.place]]
-        )
+        at = np.column_stack([places.column[rows, chosen.place], places.row[rows, chosen.place]])
         flags[found & chosen.spread] |= int(Flag.ambiguous)
-        cut = _cut(self.cameras[0], np.rint(seeds), len(inside) // 2) | _sticks_out(
+        cut = _cut(self.cameras[0], np.rint(seeds), size_px // 2) | _sticks_out(
             self.cameras[1], at, elements
         )
         flags[found & cut] |= int(Flag.at_border)
@@ -319,6 +240,19 @@ class LiteralMatcher:
             ties=np.where(found, chosen.ties, 0),
             flags=flags,
         )
+
+    def _piece(self, seeds: FloatArray, inside: BoolArray, *, whole_image: bool) -> LiteralMatches:
+        elements = self.elements(seeds, inside)
+        if whole_image:
+            places = _everywhere(self.cameras[1], inside_image(self.cameras[0], seeds))
+            hits = np.stack(
+                [self._image.scan_all(elements, row).ravel() for row in range(len(seeds))]
+            )
+        else:
+            places = self.bands(seeds)
+            hits = self.scan(elements, places)
+        chosen = choose_places(hits, places)
+        return self.decided(seeds, len(inside), (elements, places), chosen)
 
 
 def _check_size(camera: Camera, mask: BoolArray) -> None:
@@ -365,21 +299,11 @@ def _cut(camera: Camera, centre_px: FloatArray, reach: int) -> BoolArray:
         return np.asarray(((centre_px < reach) | (centre_px > last - reach)).any(axis=1))
 
 
-def _sticks_out(camera: Camera, at: IntArray, elements: MappedElements) -> BoolArray:
+def _sticks_out(camera: Camera, at: NDArray[np.int32], elements: MappedElements) -> BoolArray:
     """Tell which elements, at their places, have pixels beyond the border of image 2."""
     last = np.array(camera.size_px) - 1
     lowest, highest = elements.lowest[:, ::-1] + at, elements.highest[:, ::-1] + at
     return np.asarray(((lowest < 0) | (highest > last)).any(axis=1))
-
-
-def _joined(parts: Sequence[LiteralMatches]) -> LiteralMatches:
-    nothing = np.zeros(0)
-    none = LiteralMatches(np.zeros((0, 2)), np.zeros((0, 2)), nothing, nothing, nothing, nothing)
-    columns = (
-        np.concatenate([getattr(part, field.name) for part in (none, *parts)])
-        for field in fields(LiteralMatches)
-    )
-    return LiteralMatches(*columns)
 
 
 def match_literally(

@@ -83,8 +83,8 @@ def bands(
     lines = _lines(segments)
     per_column = int(np.ceil(2 * band_px))
     shape = (len(segments), max(int(lines.columns.max(initial=0)), 1) * per_column)
-    column, row = np.zeros(shape, np.int32), np.zeros(shape, np.int32)
-    valid = np.zeros(shape, np.bool_)
+    column, row = np.empty(shape, np.int32), np.empty(shape, np.int32)
+    valid = np.empty(shape, np.bool_)
     step = max(_CHUNK // shape[1], 1)
     width, height = cameras[1].size_px
     for first in range(0, len(segments), step):
@@ -107,7 +107,7 @@ class _Lines:
 
     upright: BoolArray
     start: FloatArray
-    sign: IntArray
+    sign: NDArray[np.int32]
     columns: IntArray
     way: FloatArray
     other: FloatArray
@@ -125,7 +125,7 @@ def _lines(segments: EpipolarSegments) -> _Lines:
     major = np.where(upright[:, None], samples[..., 1], samples[..., 0])
     other = np.where(upright[:, None], samples[..., 0], samples[..., 1])
     start, length = major[:, 0], major[:, -1] - major[:, 0]
-    sign = np.where(length < 0, -1, 1)
+    sign = np.where(length < 0, -1, 1).astype(np.int32)
     way = sign[:, None] * (major - start[:, None])
     # a curve that turns back is none that pixels can be listed along
     turns = (np.diff(way, axis=1) < 0).any(axis=1)
@@ -137,23 +137,23 @@ def _lines(segments: EpipolarSegments) -> _Lines:
 
 def _pixels(
     lines: _Lines, part: slice, band_px: float, per_column: int
-) -> tuple[FloatArray, FloatArray, BoolArray]:
+) -> tuple[NDArray[np.int32], NDArray[np.int32], BoolArray]:
     """Return both coordinates of some segments' pixels, and which exist."""
-    place = np.arange(max(int(lines.columns.max(initial=0)), 1))
+    place = np.arange(max(int(lines.columns.max(initial=0)), 1), dtype=np.int32)
     start, sign, way = lines.start[part, None], lines.sign[part, None], lines.way[part]
-    along = np.rint(start) + sign * place
+    along = np.rint(start).astype(np.int32) + sign * place
     asked = np.clip(sign * (along - start), 0.0, way[:, -1:])
     # one interpolation for all: each segment has its own stretch of the abscissa
     stretch = 1.0 + float(way.max(initial=0.0))
     shift = stretch * np.arange(len(way))[:, None]
-    middle = np.interp(
+    middle: FloatArray = np.interp(
         (asked + shift).ravel(), (way + shift).ravel(), lines.other[part].ravel()
     ).reshape(asked.shape)
-    across = np.ceil(middle - band_px)
+    across = np.ceil(middle - band_px).astype(np.int32)
     exists = place < lines.columns[part, None]
     if per_column == 1:
         return along, across, exists
-    wide = across[..., None] + np.arange(per_column)
+    wide = across[..., None] + np.arange(per_column, dtype=np.int32)
     inside = exists[..., None] & (wide < middle[..., None] + band_px)
     along = np.repeat(along, per_column, axis=1)
     return along, wide.reshape(along.shape), inside.reshape(along.shape)

@@ -95,9 +95,7 @@ def check_size(size_px: int) -> None:
         )
 
 
-def farthest_plane(
-    camera_1: Camera, camera_2: Camera, volume_mm: FloatArray
-) -> tuple[int, float]:
+def farthest_plane(camera_1: Camera, camera_2: Camera, volume_mm: FloatArray) -> tuple[int, float]:
     """Return the face of the volume that lies farthest from the cameras.
 
     Parameters
@@ -193,9 +191,7 @@ class EdgePixels:
         distance = np.where(np.isfinite(distance) & (distance > 0), distance, np.nan)
         return second.project(centre + distance[:, None] * direction)
 
-    def elements(
-        self, pixel: IntArray, centre_px: FloatArray, inside: BoolArray
-    ) -> MappedElements:
+    def elements(self, pixel: IntArray, centre_px: FloatArray, inside: BoolArray) -> MappedElements:
         """Cut the elements of candidates and carry them into view 2.
 
         Parameters
@@ -227,12 +223,12 @@ class EdgePixels:
         lowest, highest = _extents(point, offset, len(pixel))
         corner = [low.take(point) for low in lowest.T]
         place = (offset[0] - corner[0], offset[1] - corner[1])
-        word, across = _packed(point, place, np.max(highest - lowest, axis=0, initial=0), len(pixel))
+        word, across = _packed(
+            point, place, np.max(highest - lowest, axis=0, initial=0), len(pixel)
+        )
         return _without_empty(word, across, (lowest, highest), oversized)
 
-    def _oversized(
-        self, point: NDArray[np.intp], away: list[FloatArray], count: int
-    ) -> BoolArray:
+    def _oversized(self, point: NDArray[np.intp], away: list[FloatArray], count: int) -> BoolArray:
         """Mark the elements with a pixel farther from the candidate than image 2 is long."""
         longest = max(self._cameras[1].size_px)
         oversized = np.zeros(count, np.bool_)
@@ -296,7 +292,10 @@ def _packed(
 
 
 def _without_empty(
-    word: Words, across: int, ends: tuple[NDArray[np.int32], NDArray[np.int32]], oversized: BoolArray
+    word: Words,
+    across: int,
+    ends: tuple[NDArray[np.int32], NDArray[np.int32]],
+    oversized: BoolArray,
 ) -> MappedElements:
     """Keep the blocks that have pixels, moved to the front of each row."""
     lowest, highest = ends

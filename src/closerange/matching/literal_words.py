@@ -62,7 +62,7 @@ def bits_to_words(bits: NDArray[np.uint8]) -> Words:
         One word a block.
     """
     packed = np.packbits(bits, axis=1, bitorder="little")
-    return packed.view("<u8").astype(np.uint64, copy=False)
+    return np.asarray(packed.view("<u8"), np.uint64)
 
 
 def count_bits(words: Words) -> NDArray[np.uint8]:
@@ -101,4 +101,4 @@ def count_bits_by_halves(words: Words) -> NDArray[np.uint8]:
     fours = np.uint64(0x3333333333333333)
     pairs = (pairs & fours) + ((pairs >> two) & fours)
     pairs = (pairs + (pairs >> four)) & np.uint64(0x0F0F0F0F0F0F0F0F)
-    return ((pairs * np.uint64(0x0101010101010101)) >> last).astype(np.uint8)
+    return np.asarray((pairs * np.uint64(0x0101010101010101)) >> last, np.uint8)

@@ -90,6 +90,24 @@ class SeedRays:
         by_point = self.second.project_jacobian(self.at(omega))
         return np.asarray(np.einsum("nij,nj->ni", by_point, -self.ray / omega[:, None] ** 2))
 
+    def back(self, omega: FloatArray) -> FloatArray:
+        """Return steps in the first view that undo 1 px along the epipolar curve, shape (N, 2).
+
+        On the plane across the sweep axis. The grey value at a place changes by as much when the
+        image is shifted by one of these steps as when the match is shifted by 1 px.
+        """
+        pace = self.pace(omega)
+        along = pace / np.linalg.norm(pace, axis=1, keepdims=True)
+        slope = self.slope(np.ones(len(omega)), np.zeros((len(omega), 2)))
+        moved = self.by_px - self.ray[:, :, None] * slope[:, None, :]
+        by_point = self.second.project_jacobian(self.at(omega)) / omega[:, None, None]
+        warp = by_point @ moved
+        determinant = np.linalg.det(np.where(np.isfinite(warp), warp, 0.0))
+        regular = np.abs(determinant) > 1e-9
+        warp = np.where(regular[:, None, None], warp, np.eye(2))
+        step = np.linalg.solve(warp, along[:, :, None])[:, :, 0]
+        return np.where(regular[:, None], step, np.nan)
+
     def slope(self, omega: FloatArray, tilts: FloatArray) -> FloatArray:
         """Return d omega / d px of the first view on planes through points of the rays.
 

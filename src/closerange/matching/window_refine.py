@@ -53,7 +53,7 @@ class Refined:
     across_px : ndarray, shape (N,)
         How far beside the epipolar curve the window was found, to its right with y down.
     misfit_px : ndarray, shape (N,)
-        Residual beyond the noise, as a shift along the curve that would cause as much.
+        Residual beyond the noise, as a shift of each pixel that would cause as much.
     likely : ndarray, shape (N,)
         Logarithm of the likelihood against a window that explains nothing.
     moved_px : ndarray, shape (N,)
@@ -277,7 +277,8 @@ class _Fit:
         limit = LONGEST_PX * self.mapping.scale
         shift = np.clip(move[:, 0], -limit, limit)
         # a limited step keeps its direction
-        move = move * np.where(move[:, 0] != 0, shift / move[:, 0], 1.0)[:, None]
+        move *= (np.abs(shift) / np.maximum(np.abs(move[:, 0]), 1e-12))[:, None]
+        move[:, 0] = shift
         state.omega[rows] += shift / self.pace[rows]
         state.slope[rows] += move[:, 1:3] / self.pace[rows, None]
         state.turned[rows] += move[:, 1:3]
@@ -333,7 +334,9 @@ class _Fit:
         variance = np.einsum("np,np->n", trust, error**2) / mass * count / free + GREY_VARIANCE
         std = self._std(system, variance)
         noise = self._noise(rows)
-        steep = np.einsum("np,np->n", trust, system.basis[:, :, 0] ** 2) / mass
+        # of a shift in any direction: an edge along the curve is steep only across it
+        both = system.basis[:, :, 0] ** 2 + system.basis[:, :, 5] ** 2
+        steep = np.einsum("np,np->n", trust, both) / mass
         with np.errstate(divide="ignore", invalid="ignore"):
             misfit = np.sqrt(np.maximum(variance - noise, 0.0) / steep)
         total = np.maximum(weight.sum(axis=1), 1e-12)

@@ -11,7 +11,7 @@ from closerange.errors import CloseRangeWarning
 from closerange.features.image_points import ImagePoints
 from closerange.flags import Flag
 from closerange.geometry.arrays import BoolArray, FloatArray, IntArray, all_finite
-from closerange.geometry.covariance import propagate
+from closerange.geometry.covariance import positive_definite, propagate
 from closerange.geometry.intersection import widest_angle
 from closerange.position.observed import Observed, arrange
 from closerange.position.positions import Positions
@@ -177,7 +177,8 @@ def _rays_miss(rig: Rig, observed: Observed, solution: Solution) -> BoolArray:
 
     misfit = max(rig.noise_px**2 - rig.tau_px**2, 0.0)  # tau is in the points' covariance already
     cov = observed.cov_px2 + solution.predicted_px2 + misfit * np.eye(2)
-    used = observed.used & all_finite(solution.residual_px, 2)
+    known = positive_definite(cov.reshape(-1, 2, 2)).reshape(observed.used.shape)
+    used = observed.used & all_finite(solution.residual_px, 2) & known
     cov = np.where(used[..., None, None], cov, np.eye(2))
     residual = np.where(used[..., None], solution.residual_px, 0.0)
     squared = np.einsum("mci,mci->m", residual, np.linalg.solve(cov, residual[..., None])[..., 0])

@@ -58,11 +58,11 @@ def write_positions(positions: Positions, path: Path | str) -> None:
     columns |= _covariance_cells(positions.cov_mm2, COVARIANCE)
     noise = _covariance_cells(positions.noise_cov_mm2, NOISE)
     columns |= noise if any(map(any, noise.values())) else {}
+    if positions.dof is not None:
+        columns["dof"] = [str(positions.dof)] * len(positions)
     columns["residual_px"] = [float_text(value) for value in positions.residual_px]
     columns["cameras"] = [str(count) for count in positions.cameras]
     columns["flags"] = [format_flags(int(flag)) for flag in positions.flags]
-    if positions.dof is not None:
-        columns["dof"] = [str(positions.dof)] * len(positions)
     write_csv(path, list(columns), zip(*columns.values(), strict=True))
 
 

@@ -16,14 +16,7 @@ from closerange.rig.models import Model
 from closerange.rig.observations import Observations, listed, without_disc_bias
 from closerange.rig.outliers import MAX_SHARE, ROUNDING_PX
 from closerange.rig.solution import ROUNDS, SETTLED
-from closerange.rig.weights import (
-    Stated,
-    common_variance,
-    image_errors,
-    pull_of,
-    shared_errors,
-    whitener_of,
-)
+from closerange.rig.weights import common_variance, pull_of, shared_errors, whitener_of
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -79,10 +72,10 @@ class BundleSolution:
         Usable rows with their weights.
     used : ndarray of bool, shape (n,)
         Usable rows that took part.
-    stated : Stated
-        What was known of the usable rows.
     tau_px : float
         Common part of the points' standard deviation.
+    weighted : bool
+        Whether residuals were weighed by covariances.
     """
 
     fit: BundleFit
@@ -90,13 +83,8 @@ class BundleSolution:
     xy_px: FloatArray
     seen: Sightings
     used: BoolArray
-    stated: Stated
     tau_px: float
-
-    @property
-    def weighted(self) -> bool:
-        """Whether residuals were weighed by covariances."""
-        return self.stated.any
+    weighted: bool
 
     @property
     def kept(self) -> BoolArray:
@@ -113,20 +101,19 @@ class BundleSolution:
     def covariance(self) -> FloatArray:
         """Return the covariance of the cameras' parameters, shape (P, P).
 
-        A point's error on the target goes with it into all placements and images, see
-        `weights.parameter_covariance`.
+        A point's error on the target goes with it into all placements and images, where the
+        parameters take up most of it: what the residuals show of it tells too little to be taken
+        off them. It therefore counts as image noise too, which errs on the safe side.
         """
-        fit, bundle = self.fit, self.fit.bundle
-        std = self.stated.std_mm[self.used]
+        fit, bundle, observations = self.fit, self.fit.bundle, self.placed.observations
+        total = (1.0 if self.weighted else self.noise_px**2) * fit.cofactor
+        std = observations.std_mm[self.kept]
         if std.any():
-            seen, rows = self.seen.select(self.used), self.stated.control_row[self.used]
+            seen = self.seen.select(self.used)
             turns = np.stack([pose.rotation for pose in bundle.poses])[seen.placement]
             by_point = bundle.by_world(seen) @ turns * std[:, None, None]
-            cov = self.stated.cov_px2[self.used]
-            total = image_errors(fit, seen.whitener, cov, self.tau_px)
-            total = total + shared_errors(pull_of(fit, seen.whitener, by_point), rows)
-        else:
-            total = (1.0 if self.weighted else self.noise_px**2) * fit.cofactor
+            pull = pull_of(fit, seen.whitener, by_point)
+            total = total + shared_errors(pull, observations.control_row[self.kept])
         count = bundle.camera_count
         symmetric: FloatArray = 0.5 * (total + total.T)[:count, :count]
         return symmetric
@@ -212,36 +199,19 @@ def solve_bundle(placed: Placed, model: Model) -> BundleSolution:
 def _settle(placed: Placed, xy_px: FloatArray, start: Bundle) -> BundleSolution:
     """Settle blunders and weights together, as `solution.solve` does."""
     observations, bundle, seen = placed.observations, start, placed.sightings(xy_px)
-    stated = _stated(observations)
-    tau2 = -1.0
-    for _ in range(ROUNDS):
-        fit, used = fit_bundle_without_blunders(seen, bundle, trials=len(observations))
-        bundle = fit.bundle
-        total = _stated_in_images(stated, bundle, seen)
-        last, tau2 = tau2, common_variance(fit.residual_px, total[used], fit.dof)
-        if not stated.any or (last >= 0 and abs(tau2 - last) <= SETTLED * last):
-            break
-        seen = seen.weighted(whitener_of(total + max(tau2, ROUNDING_PX**2) * np.eye(2)))
-    return BundleSolution(fit, placed, xy_px, seen, used, stated, float(np.sqrt(tau2)))
-
-
-def _stated(observations: Observations) -> Stated:
-    """Collect what is known of the usable rows."""
-    rows = observations.usable
     cov = np.empty((len(observations), 2, 2))
     for i in range(len(observations.cameras)):
         cov[observations.rows(i)] = observations.stated_cov(i)
-    return Stated(cov[rows], observations.std_mm[rows], observations.control_row[rows])
-
-
-def _stated_in_images(stated: Stated, bundle: Bundle, seen: Sightings) -> FloatArray:
-    """Return the stated part of the covariances, (n, 2, 2); it is the same for a turned target."""
-    world = bundle.world_mm(seen.placement, seen.target_mm)
-    total = np.empty_like(stated.cov_px2)
-    for i, camera in enumerate(bundle.cameras):
-        rows = seen.camera == i
-        total[rows] = stated.select(rows).in_image(camera, world[rows])
-    return total
+    cov = cov[observations.usable]
+    weighted, tau2 = bool(cov.any()), -1.0
+    for _ in range(ROUNDS):
+        fit, used = fit_bundle_without_blunders(seen, bundle, trials=len(observations))
+        bundle = fit.bundle
+        last, tau2 = tau2, common_variance(fit.residual_px, cov[used], fit.dof)
+        if not weighted or (last >= 0 and abs(tau2 - last) <= SETTLED * last):
+            break
+        seen = seen.weighted(whitener_of(cov + max(tau2, ROUNDING_PX**2) * np.eye(2)))
+    return BundleSolution(fit, placed, xy_px, seen, used, float(np.sqrt(tau2)), weighted)
 
 
 def _require_agreement(solution: BundleSolution) -> None:

@@ -19,7 +19,7 @@ from closerange.errors import GeometryError
 from closerange.geometry.arrays import BoolArray, FloatArray
 from closerange.rig.camera import Camera
 from closerange.rig.camera_fit import CameraFit, fit_camera
-from closerange.rig.fit import Fit
+from closerange.rig.fit import Fit, inner_variance
 from closerange.rig.view import View, whiten
 
 FALSE_ALARM = 0.01
@@ -312,7 +312,7 @@ def _sorted_robustly(view: View, free: tuple[str, ...]) -> BoolArray:
     """Keep the points that a robust fit explains, from a start that blunders have no part in."""
     start = fit_camera(view.select(consensus(view)), free).camera
     square = _robust_squares(view, free, start)
-    variance = max(_inner_variance(square, view.xy_px.size - len(free)), ROUNDING_PX**2)
+    variance = max(inner_variance(square, view.xy_px.size - len(free)), ROUNDING_PX**2)
     return np.asarray(square <= ROBUST_LIMIT * variance)
 
 
@@ -323,7 +323,7 @@ def _robust_squares(view: View, free: tuple[str, ...], start: Camera) -> FloatAr
     """
     camera, square, last = start, _squares(view, start), 0.0
     for _ in range(REWEIGHTINGS):
-        variance = max(_inner_variance(square, view.xy_px.size - len(free)), ROUNDING_PX**2)
+        variance = max(inner_variance(square, view.xy_px.size - len(free)), ROUNDING_PX**2)
         if not np.isfinite(variance) or abs(variance - last) <= SETTLED * last:
             break
         last = variance
@@ -357,12 +357,7 @@ def _plain_px(fit: CameraFit) -> float:
 
 
 def _inner_noise(whitened: FloatArray, dof: int) -> float:
-    return float(np.sqrt(_inner_variance(np.sum(whitened**2, axis=1), dof)))
-
-
-def _inner_variance(square: FloatArray, dof: int) -> float:
-    """Variance of one coordinate by the median: squares of two Gaussians are exponential."""
-    return float(np.median(square) / (2 * np.log(2)) * 2 * len(square) / max(dof, 1))
+    return float(np.sqrt(inner_variance(np.sum(whitened**2, axis=1), dof)))
 
 
 def _floor(fit: Fit) -> float:

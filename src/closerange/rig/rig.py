@@ -202,7 +202,8 @@ class Rig:
     @property
     def uncertainty_known(self) -> bool:
         """Whether noise and covariance are such that positions get covariances."""
-        return 0 < self.noise_px < np.inf and bool(np.isfinite(self.parameter_cov).all())
+        known = bool(np.isfinite(self.parameter_cov).all())
+        return known and 0 < self.noise_px < np.inf and self.dof > 0
 
 
 def _micrometres(value_mm: float) -> str:

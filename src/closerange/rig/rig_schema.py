@@ -206,9 +206,9 @@ def _require_uncertainty(rig: Rig, fields: dict[str, Reader]) -> None:
     """Refuse an unknown uncertainty, unless the verdict marks all that is measured with it."""
     if rig.uncertainty_known or (rig.trust is not None and rig.trust.verdict == "untrustworthy"):
         return
-    key = "noise_px" if math.isnan(rig.noise_px) else "parameter_cov"
+    key = "noise_px" if math.isnan(rig.noise_px) else "parameter_cov" if rig.dof else "dof"
     fields[key].fail(
-        "null: positions would have no covariance, and nothing would say so",
+        "unknown: positions would have no covariance that holds, and nothing would say so",
         "calibrate again; only a rig with the verdict 'untrustworthy' may lack it",
     )
 

@@ -17,7 +17,7 @@ from closerange.features.edge_chains import chain_places
 from closerange.features.image_points import ImagePoints
 from closerange.flags import Flag
 from closerange.geometry.arrays import BoolArray, FloatArray, IntArray
-from closerange.images import Frame
+from closerange.images import Frame, check_frame
 from closerange.matching.corner_matcher import match_corners
 from closerange.matching.correspondences import Correspondences
 from closerange.matching.literal import match_literally
@@ -180,6 +180,9 @@ def match_images(  # noqa: PLR0913
         frames = {seeds.camera[0]: frames[seeds.camera[0]], **frames}
         frames = _first(frames, seeds.camera[0])
     views = views_of([rig.camera(name) for name in frames], [f.pixels for f in frames.values()])
+    for view, frame in zip(views, frames.values(), strict=True):
+        if not len(view.edges):
+            check_frame(frame)  # not before: it takes a dense speckle for noise
     asked = _Asked(seeds, corners, placement or "", method, element_px or LITERAL_PX)
     found = _found(views, volume, asked, progress)
     found = _with_marks(found, frames, untrusted=not rig.trusted)

@@ -13,16 +13,17 @@ from closerange.matching.correspondences import Correspondences
 from closerange.matching.matcher import View, match_views
 from closerange.rig.camera import Camera
 
-SUSPICIOUS_SHARE = 0.25
-"""Share of points matched without a flag below which other orders of the images are tried: views of
-one scene usually share half of their edges and more."""
+SUSPICIOUS_SHARE = 0.5
+"""Share of points matched without a flag below which other orders of the images are tried. Of the
+edges of a part two views share more; a nearly symmetric pair of exchanged views, which shows the
+relief turned inside out, matches up to two fifths."""
 
 FEWEST = 20
 """Edge points matched without a flag from which an order of the images counts as one that fits."""
 
-BETTER = 3.0
-"""Factor by which another order must match more edge points. Wrong images match by chance only: on
-rendered scenes a ninth of what the right ones give, or nothing."""
+BETTER = 1.25
+"""Factor by which another order must match more edge points. Usually it is above ten; where a pair
+is nearly symmetric 1.4, and 1 for a flat part, which looks the same in both orders."""
 
 MAX_CAMERAS = 4
 """Cameras up to which all orders of images are tried."""

@@ -14,7 +14,7 @@ from closerange.features.image_points import ImagePoints
 from closerange.features.points_table import read_points
 from closerange.flags import Flag
 from closerange.geometry.arrays import FloatArray
-from closerange.images import Frame, check_duplicates, check_frame, read_image
+from closerange.images import Frame, check_duplicates, check_interlace, read_image
 from closerange.matching.correspondences import Correspondences
 from closerange.matching.sight import between_planes, checked_volume
 from closerange.rig.rig import Rig
@@ -43,8 +43,11 @@ def read_frames(rig: Rig, images: Images) -> dict[str, Frame]:
     InputError
         If there are fewer than two, a camera is not in the rig, an image has another size than
         its camera or one image is given for two cameras.
-    DetectionError
-        If an image is uniform.
+
+    Warns
+    -----
+    CloseRangeWarning
+        If an image is interlaced.
     """
     if len(images) < 2:
         raise InputError(
@@ -65,9 +68,9 @@ def read_frames(rig: Rig, images: Images) -> dict[str, Frame]:
                 "use images of the calibrated size, or calibrate with images of this one"
             ))  # fmt: skip
         frames[name] = Frame(name, frame.pixels, frame.time_s, frame.source)
-    for frame in frames.values():
-        check_frame(frame)
     check_duplicates(frames.values())
+    for frame in frames.values():
+        check_interlace(frame)
     return frames
 
 
