@@ -60,6 +60,8 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--shared", type=Path, default=Path(__file__).parents[1].parent / "shared")
     folder = parser.parse_args().shared / "data" / "rendered"
+    if not folder.is_dir():
+        parser.error(f"no folder {folder}; name the one that holds data/ with --shared")
     print("rms error of disc centres per image, px: worst image (all images), u / v")
     for set_name, pattern in SETS.items():
         truth = truth_rows(folder / set_name)

@@ -4,10 +4,11 @@
     python benchmarks/bench_matching.py --scene FOLDER [--scene FOLDER] [--calibration FOLDER]
 
 Points are all thinned strong edge points (blur-minimum above Trussell's threshold). Rendered
-scenes have exact truth (see `matching.scene_truth`), any folder of their layout can be given with
-``--scene``; the speckled plate has the matches of another program, the rectified pair a map in
-whole pixels. ``--calibrated`` measures each rendered scene once more with cameras calibrated from
-the images of disc plates beside it. Methods that cannot run are named with the reason.
+scenes have exact truth (see `matching.scene_truth`); any folder of their layout can be given with
+``--scene``. The speckled plate has the matches of another program, the rectified pair a map in
+whole pixels; of both a part is taken, unless ``--whole``, which needs memory. ``--calibrated``
+measures each rendered scene once more with cameras calibrated from the images of disc plates
+beside it. Methods that cannot run are named with the reason.
 """
 
 from __future__ import annotations
@@ -64,7 +65,9 @@ def _scenes(options: argparse.Namespace) -> Iterator[Scene]:
         _missing(data, "the scenes are in the shared data; give --shared or --scene FOLDER")
         return
     folders = options.scene or [data / "rendered" / name for name in RENDERED]
-    for folder in folders[:1] if options.quick and not options.scene else folders:
+    if options.quick and not options.scene:
+        folders = folders[:1]
+    for folder in [] if options.real else folders:
         absent = [name for name in NEEDED if not (folder / name).is_file()]
         if absent:
             _missing(folder, f"a rendered scene has {', '.join(absent)}")
@@ -73,14 +76,14 @@ def _scenes(options: argparse.Namespace) -> Iterator[Scene]:
         yield scene
         if options.calibrated:
             yield from _calibrated(scene, folder, options.calibration)
-    if options.scene or options.quick:
+    if not options.real and (options.scene or options.quick):
         return
     for folder, read in (
         (data / "dice-gt4-stereo", scenes.speckled_plate),
         (data / "opencv-pairs", scenes.aloe),
     ):
         if folder.is_dir():
-            yield read(folder)
+            yield read(folder, whole=options.whole)
         else:
             _missing(folder, "this scene is left out")
 
@@ -102,12 +105,18 @@ def _options() -> argparse.Namespace:
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("--scene", type=Path, action="append", default=[], metavar="FOLDER")
-    parser.add_argument("--z", type=float, nargs=2, default=scenes.HEIGHTS_MM, metavar=("MIN", "MAX"))
+    parser.add_argument(
+        "--z", type=float, nargs=2, default=scenes.HEIGHTS_MM, metavar=("MIN", "MAX")
+    )
     parser.add_argument("--calibrated", action="store_true", help="also with calibrated cameras")
     parser.add_argument("--calibration", type=Path, metavar="FOLDER", help="disc plates to use")
-    parser.add_argument("--method", action="append", default=[], help="only methods named like this")
+    parser.add_argument(
+        "--method", action="append", default=[], help="only methods named like this"
+    )
+    parser.add_argument("--real", action="store_true", help="only the two real pairs")
     parser.add_argument("--repeats", type=int, default=5, help="timed runs of each method")
     parser.add_argument("--quick", action="store_true", help="one scene, one timed run")
+    parser.add_argument("--whole", action="store_true", help="the two real pairs uncut")
     parser.add_argument("--json", type=Path, metavar="FILE", help="also write all figures")
     parser.add_argument("--shared", type=Path, default=Path(__file__).parents[1].parent / "shared")
     return parser.parse_args()

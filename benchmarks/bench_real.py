@@ -3,12 +3,14 @@
     python benchmarks/bench_real.py [--shared ../shared]
 
 The step block is calibrated from two thirds of its dots; the other third is measured and compared
-with the dots' design positions. Our own detection of the dots is compared with the published one.
+with the dots' design positions. Our own detection of the dots is compared with the published one,
+and its stated covariances with the errors of the dots that were held out.
 """
 
 from __future__ import annotations
 
 import argparse
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -18,13 +20,18 @@ from closerange.features.discs import find_discs
 from closerange.features.image_points import ImagePoints
 from closerange.features.pattern import Chessboard
 from closerange.features.target import Target
+from closerange.geometry.covariance import mahalanobis_squared, region_limit
 from closerange.images import read_image
+from closerange.rig.observations import EXCLUDING
 from closerange.workflows.calibrate import calibrate
 from closerange.workflows.detect import detect
 from closerange.workflows.measure import measure
 
 SIZE = (1280, 1024)
 CAMERAS = ("cam1", "cam2", "cam3")
+
+MEDIAN_RATIO = 2.366 / 3
+"""Median of e'V^-1e / 3 where covariances hold: that of chi-square, 3 degrees of freedom."""
 
 
 def step_block_points(folder: Path, camera: str) -> tuple[ImagePoints, dict[str, list[float]]]:
@@ -71,19 +78,63 @@ def step_block(folder: Path) -> None:
         )
 
 
-def own_detection(folder: Path) -> None:
-    """Find the dots ourselves and compare with the published detections."""
+def own_detection(folder: Path) -> tuple[ImagePoints, dict[str, list[float]]]:
+    """Find the dots ourselves, compare with the published detections; return what was found."""
+    points: ImagePoints | None = None
+    known: dict[str, list[float]] = {}
     for camera in CAMERAS:
         frame = read_image(folder / f"cal_{camera}.png", camera=camera)
         discs = find_discs(frame, polarity="white-on-dark")
-        published, _ = step_block_points(folder, camera)
+        published, design = step_block_points(folder, camera)
+        known.update(design)
         apart = np.linalg.norm(published.xy_px[:, None] - discs.xy_px[None], axis=2)
-        nearest = apart.min(axis=1)
+        row, nearest = apart.argmin(axis=1), apart.min(axis=1)
         near = nearest < 1.5
+        flags = discs.flags[row[near]]
+        kept_out = int(((flags & int(EXCLUDING)) != 0).sum())
         print(
             f"own detection, {camera}: {int(near.sum())} of {len(published)} published dots within "
-            f"1.5 px, median distance {np.median(nearest[near]):.3f} px, rms "
+            f"1.5 px, of these {int((flags == 0).sum())} without a flag and {kept_out} kept out of "
+            f"fits; median distance {np.median(nearest[near]):.3f} px, rms "
             f"{np.sqrt(np.mean(nearest[near] ** 2)):.3f} px; {len(discs.xy_px)} candidates"
+        )
+        found = ImagePoints.of(
+            camera=camera,
+            point=[name for name, yes in zip(published.point, near, strict=True) if yes],
+            xy_px=discs.xy_px[row[near]],
+            cov_px2=discs.cov_px2[row[near]],
+            flags=flags,
+            size_px={camera: SIZE},
+        )
+        points = found if points is None else points + found
+    assert points is not None
+    return points, known
+
+
+def coverage(points: ImagePoints, known: dict[str, list[float]]) -> None:
+    """Measure every third dot with a calibration from the rest; compare errors with covariances."""
+    ordered = sorted(known, key=lambda name: known[name])
+    check = np.arange(len(ordered)) % 3 == 0
+    control = ControlPoints.of(ordered, [known[n] for n in ordered], check=check)
+    held_out = {n for n, c in zip(ordered, check, strict=True) if c}
+    unknown = replace(points, cov_px2=np.full_like(points.cov_px2, np.nan))
+    for label, dots in (("stated covariances", points), ("without covariances", unknown)):
+        rig = calibrate(dots, control=control, accept_untrusted=True)
+        positions = measure(rig, dots.select([name in held_out for name in dots.point]))
+        error = positions.xyz_mm - [known[n] for n in positions.point]
+        good = positions.measured & (positions.flags == 0)
+        rms, everything = (
+            " / ".join(f"{value:.4f}" for value in np.sqrt(np.mean(error[rows] ** 2, axis=0)))
+            for rows in (good, positions.measured)
+        )
+        square = mahalanobis_squared(error, positions.cov_mm2)[good]
+        inside = np.mean(square <= region_limit(3, positions.dof))
+        print(
+            f"own detection, {label}: {len(positions)} held-out dots, {positions.measured.sum()} "
+            f"measured (rms {everything} mm), {good.sum()} without a flag: rms {rms} mm, "
+            f"e'V^-1e / 3 mean {square.mean() / 3:.2f}, median "
+            f"{np.median(square) / 3 / MEDIAN_RATIO:.2f} of chi-square's, inside the 95 % region "
+            f"{inside:.1%}"
         )
 
 
@@ -111,8 +162,10 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--shared", type=Path, default=Path(__file__).parents[1].parent / "shared")
     data = parser.parse_args().shared / "data"
+    if not data.is_dir():
+        parser.error(f"no folder {data}; name the one that holds data/ with --shared")
     step_block(data / "myptv-step-block")
-    own_detection(data / "myptv-step-block")
+    coverage(*own_detection(data / "myptv-step-block"))
     chessboard(data / "opencv-stereo-chessboard")
 
 

@@ -39,6 +39,7 @@ class BoxScene:
 
     rig: Rig
     images: dict[str, NDArray[np.uint8]]
+    boxes: tuple[tuple[float, ...], ...]
 
     def nearest_height(self, camera: Camera, xy_px: NDArray[Any]) -> NDArray[Any]:
         """Return the Z of pixels' rays on the nearest surface within 1.2 px, shape (N,)."""
@@ -103,7 +104,7 @@ def render_boxes(size_px: tuple[int, int] = (320, 256), *, noise: float = 1.5) -
         grey = np.clip(cv2.GaussianBlur(_drawn(camera), (0, 0), 0.6), 0, 255)
         grey += rng.normal(0.0, noise, grey.shape)
         images[camera.name] = np.clip(np.rint(grey), 0, 255).astype(np.uint8)
-    return BoxScene(rig, images)
+    return BoxScene(rig, images, BOXES)
 
 
 def _drawn(camera: Camera) -> NDArray[Any]:

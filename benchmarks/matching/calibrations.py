@@ -30,8 +30,7 @@ def calibration_folder(scene: Path) -> Path | None:
             continue
         have = read_cameras(folder)
         if all(
-            name in have
-            and np.allclose(have[name].projection_matrix, camera.projection_matrix)
+            name in have and np.allclose(have[name].projection_matrix, camera.projection_matrix)
             for name, camera in wanted.items()
         ):
             return folder
@@ -79,7 +78,9 @@ def _detected(folder: Path, images: list[tuple[str, str, str]], grid: DiscGrid) 
 def _grid(rows: list[dict[str, str]]) -> tuple[DiscGrid, dict[int, str]]:
     """Return the pattern of a plate parallel to XY and the name of each target's number."""
     pose = rows[0]["pose"]
-    own = {int(r["target"]): (float(r["X_mm"]), float(r["Y_mm"])) for r in rows if r["pose"] == pose}
+    own = {
+        int(r["target"]): (float(r["X_mm"]), float(r["Y_mm"])) for r in rows if r["pose"] == pose
+    }
     across = sorted({round(x, 3) for x, _ in own.values()})
     down = sorted({round(y, 3) for _, y in own.values()}, reverse=True)
     pitch = (across[1] - across[0], down[0] - down[1])

@@ -62,10 +62,12 @@ class DepthContours:
         for axis in (0, 1):
             for flip in (False, True):
                 view = depth_mm if axis else depth_mm.T
-                found = _one_way(view[:, ::-1] if flip else view)
-                for total, part in zip((near, bent, even), found, strict=True):
-                    part = part[:, ::-1] if flip else part
-                    total |= part if axis else part.T
+                masks = [near, bent, even]
+                for mask, found in zip(
+                    masks, _one_way(view[:, ::-1] if flip else view), strict=True
+                ):
+                    there = found[:, ::-1] if flip else found
+                    np.logical_or(mask, there if axis else there.T, out=mask)
         return cls(near, bent & ~even, _round(depth_mm, near))
 
 

@@ -20,6 +20,6 @@ def keypoint_summary(scene: Scene) -> str:
     error = np.linalg.norm(second - truth.xy_px, axis=1)
     right = known & (truth.kind != int(Kind.occluded)) & (error < scene.right_px)
     return (
-        f"{text}, {int(known.sum())} of them on surfaces with truth; of these {int(right.sum())} are "
-        f"right within {scene.right_px:g} px."
+        f"{text}, {int(known.sum())} of them on surfaces with truth; of these {int(right.sum())} "
+        f"are right within {scene.right_px:g} px."
     )

@@ -48,12 +48,14 @@ class Figures:
     `raw` and `raw_fine`: share of the visible points within `Scene.right_px` and 0.1 px, before
     filters. `checked`: after the left-right check, `final`: without any flag. `recall` is the
     share of the visible points that is kept and right. Heights in mm, of the final points that are
-    visible (all of them for p95, the right ones for `height_right_p95`).
+    visible (all of them for p95, the right ones for `height_right_p95`). `median_px` is the whole
+    distance from the truth, `median_along_px` its part along the epipolar curve.
     """
 
     points: int
     visible: int
     occluded: int
+    surface: int
     raw: float
     raw_fine: float
     checked: Stage
@@ -63,6 +65,7 @@ class Figures:
     height_p95: float
     height_right_p95: float
     median_px: float
+    median_along_px: float
     wrong_faces: int
     cover_px: float
     cover_mm: float
@@ -90,6 +93,7 @@ def figures(scene: Scene, matches: Matches) -> Figures:
         points=len(kind),
         visible=int(visible.sum()),
         occluded=int(hidden.sum()),
+        surface=int(surface.sum()),
         raw=_share(good, visible),
         raw_fine=_share(visible & (error < FINE_PX), visible),
         checked=_stage(checked, good, visible, hidden, error),
@@ -99,6 +103,7 @@ def figures(scene: Scene, matches: Matches) -> Figures:
         height_p95=_quantile(height, 0.95),
         height_right_p95=_quantile(height[good[final & visible][: len(height)]], 0.95),
         median_px=_quantile(kept_error, 0.5),
+        median_along_px=_median_along(scene, matches, final & visible),
         wrong_faces=wrong_faces(scene.xy_px, wrong),
         cover_px=_cover_px(scene, matches, final & visible),
         cover_mm=np.nan if matches.cov_px2 is None else _mean(height < NORMAL_95 * height_std),
@@ -179,6 +184,14 @@ def _cover_px(scene: Scene, matches: Matches, rows: BoolArray) -> float:
         return float("nan")
     along, _ = _along(scene, matches.xy_px, matches.cov_px2, rows)
     return _mean(np.abs(along) < NORMAL_95)
+
+
+def _median_along(scene: Scene, matches: Matches, rows: BoolArray) -> float:
+    """Return the median error along the epipolar curves: matches lie on them by construction."""
+    if not rows.any():
+        return float("nan")
+    exact = np.broadcast_to(np.eye(2), (len(rows), 2, 2))
+    return _quantile(np.abs(_along(scene, matches.xy_px, exact, rows)[0]), 0.5)
 
 
 def _along(

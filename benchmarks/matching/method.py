@@ -34,12 +34,16 @@ class Matches:
         What passes the left-right check (or the method's own equivalent) alone.
     cov_px2 : ndarray, shape (M, 2, 2), or None
         Covariance in the second view of the surface point that is seen at the given point.
+    one_way_s : float
+        Time of the search alone, where a left-right check was added to it by this benchmark; NaN
+        where the check is the method's own.
     """
 
     xy_px: FloatArray
     flags: NDArray[np.int64]
     checked: BoolArray
     cov_px2: FloatArray | None = None
+    one_way_s: float = float("nan")
 
     def __len__(self) -> int:
         return len(self.xy_px)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -88,9 +89,11 @@ class Literal:
     ) -> Matches:
         """Find points of the first view in the second; back again for the left-right check."""
         literal = _module("literal", "match_literal")
+        start = time.perf_counter()
         there = literal.match_literal(
             images[:2], cameras[:2], points_px, volume_mm, side_px=self.side_px
         )
+        one_way = time.perf_counter() - start
         found = np.array(there.xy_px)
         known = np.isfinite(found).all(axis=1)
         back = np.full_like(found, np.nan)
@@ -100,7 +103,8 @@ class Literal:
             ).xy_px
         with np.errstate(invalid="ignore"):
             returns = np.linalg.norm(back - points_px, axis=1) < zncc_sweep.RETURN_PX
-        return Matches(found, np.where(returns, 0, REJECTED), returns)
+        flags = np.where(returns, there.flags, int(Flag.inconsistent))
+        return Matches(found, flags.astype(np.int64), returns, one_way_s=one_way)
 
 
 def methods(names: Sequence[str] = ()) -> list[Method]:

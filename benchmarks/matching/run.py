@@ -27,6 +27,7 @@ class Result:
     figures: Figures | None
     seconds: tuple[float, ...] = ()
     memory_mb: float = float("nan")
+    one_way_s: float = float("nan")
     tail: dict[str, int] | None = None
     reason: str = ""
 
@@ -52,6 +53,7 @@ class Result:
                 **self.figures.as_dict(),
                 "seconds": list(self.seconds),
                 "us_per_point": self.us_per_point,
+                "one_way_us_per_point": 1e6 * self.one_way_s / max(self.figures.points, 1),
                 "memory_mb": self.memory_mb,
                 "tail": self.tail,
             }
@@ -76,17 +78,20 @@ def run(method: Method, scene: Scene, repeats: int) -> Result:
         return Result(scene.name, method.name, None, reason=reason)
     first = time.perf_counter() - start
     # what takes so long is not decided by a cold cache
+    ways = [matches.one_way_s]
     seconds = [first] if first > LONG_S else []
     for _ in range(0 if seconds else repeats):
         start = time.perf_counter()
-        work()
+        ways.append(work().one_way_s)
         seconds.append(time.perf_counter() - start)
+    one_way = float(np.median(ways))
     return Result(
         scene.name,
         method.name,
         figures(scene, matches),
         tuple(seconds),
         memory,
+        one_way,
         tail(scene, matches),
     )
 

@@ -44,7 +44,7 @@ class Kind(IntEnum):
     surface = 1  # on a smooth surface that both see: print, shadow, shading, reflection, noise
     occluded = 2  # hidden in the other view
     outline = 3  # outline, highlight or shading of a curved body: bound to no surface point
-    unknown = 4  # at a tear of the depth map without a mesh edge and too narrow to judge
+    unknown = 4  # at a tear of the depth map without a mesh edge, or at the border of the visible
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -74,7 +74,9 @@ class PointTruth:
 
     def select(self, rows: Any) -> PointTruth:
         """Keep some points."""
-        return PointTruth(self.kind[rows], self.xyz_mm[rows], self.xy_px[rows], self.spread_px[rows])
+        return PointTruth(
+            self.kind[rows], self.xyz_mm[rows], self.xy_px[rows], self.spread_px[rows]
+        )
 
 
 def read_cameras(folder: Path) -> dict[str, Camera]:
@@ -116,9 +118,7 @@ class SceneTruth:
         self.edges = MeshEdges.read(folder / "edge_points.csv")
         self.contours = DepthContours.of(self.depth_mm)
         # distance of each pixel from the near side of a tear, and which pixel that is
-        self._tear_px, self._tear = distance_transform_edt(
-            ~self.contours.near, return_indices=True
-        )
+        self._tear_px, self._tear = distance_transform_edt(~self.contours.near, return_indices=True)
 
     def of(self, xy_px: FloatArray, tangent: FloatArray | None = None) -> PointTruth:
         """Return the truth of points.
@@ -188,11 +188,10 @@ class SceneTruth:
         depth = self.second.depth_mm(xyz_mm)
         height, width = self._second_depth_mm.shape
         column, row = np.rint(np.nan_to_num(xy, nan=-9.0)).astype(int).T
-        inside = (column >= 1) & (row >= 1) & (column < width - 1) & (row < height - 1)
-        column, row = np.clip(column, 1, width - 2), np.clip(row, 1, height - 2)
-        around = np.stack(
-            [self._second_depth_mm[row + i, column + j] for i in (-1, 0, 1) for j in (-1, 0, 1)]
-        )
+        inside = (column >= 0) & (row >= 0) & (column < width) & (row < height)
+        column, row = np.clip(column, 0, width - 1), np.clip(row, 0, height - 1)
+        padded = np.pad(self._second_depth_mm, 1, mode="edge")
+        around = np.stack([padded[row + i, column + j] for i in range(3) for j in range(3)])
         # hidden where even the farthest surface around lies before the point
         return np.asarray(inside & (around.max(axis=0) > depth - SURFACE_MM))
 
@@ -205,11 +204,12 @@ class SceneTruth:
         # at a tear the point belongs to the nearer surface
         near_row, near_column = self._tear[:, row, column]
         row, column = np.where(torn, near_row, row), np.where(torn, near_column, column)
-        hidden = ~self._visible_around(row, column)
+        around = self._visible_around(row, column)
         curved = torn & self._around(self.contours.curved, row, column)
         kind = np.full(len(xy), int(Kind.surface))
-        kind[torn] = int(Kind.unknown)
-        kind[hidden] = int(Kind.occluded)
+        # at the border of what is visible a pixel more or less decides
+        kind[torn | (around & ~self.visible[row, column])] = int(Kind.unknown)
+        kind[~around] = int(Kind.occluded)
         kind[curved | self.contours.round[row, column]] = int(Kind.outline)
         return kind, self.depth_mm[row, column]
 
@@ -230,9 +230,7 @@ class SceneTruth:
     def _around(mask: BoolArray, row: NDArray[np.intp], column: NDArray[np.intp]) -> BoolArray:
         """Tell whether most marks of contours within a pixel are set: single pixels may err."""
         padded = np.pad(mask, 1)
-        count = sum(
-            padded[row + i, column + j].astype(int) for i in (0, 1, 2) for j in (0, 1, 2)
-        )
+        count = sum(padded[row + i, column + j].astype(int) for i in (0, 1, 2) for j in (0, 1, 2))
         return np.asarray(count >= 2)
 
     def _on_ray(self, xy: FloatArray, depth_mm: FloatArray) -> FloatArray:

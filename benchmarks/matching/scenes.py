@@ -29,6 +29,11 @@ HEIGHTS_MM = (-53.0, 50.0)
 
 ALOE_FOCAL_PX, ALOE_BASELINE_MM = 3740.0, 160.0  # the makers' data; any would do
 ALOE_SLACK_PX = 10.0
+ALOE_ROWS = slice(427, 683)
+"""A band of the rectified pair: rows do not know each other, and 60 000 points tell enough."""
+
+PLATE_CROP_PX = (640, 512)
+"""Middle part of the speckled images; whole ones have 300 000 edge points for 121 seeds."""
 PLATE_SLACK_MM = 10.0
 
 
@@ -94,7 +99,9 @@ def true_rig(cameras: tuple[Camera, ...], volume_mm: FloatArray) -> Rig:
 def finite_volume(volume_mm: FloatArray) -> FloatArray:
     """Replace limits that do not exist by far ones: linear algebra wants a middle."""
     span = float(np.ptp(volume_mm[:, np.isfinite(volume_mm).all(axis=0)]))
-    return np.clip(volume_mm, *(volume_mm[np.isfinite(volume_mm)].mean() + span * np.array([-2, 2])))
+    return np.clip(
+        volume_mm, *(volume_mm[np.isfinite(volume_mm)].mean() + span * np.array([-2, 2]))
+    )
 
 
 def strong_edges(pixels: NDArray[np.uint8]) -> EdgePoints:
@@ -105,10 +112,8 @@ def strong_edges(pixels: NDArray[np.uint8]) -> EdgePoints:
     return edges.select(mask[row, column] > 0)
 
 
-def rendered(
-    folder: Path, heights_mm: tuple[float, float] = HEIGHTS_MM, *, every: int = 1
-) -> Scene:
-    """Read a rendered scene; `every` thins the points."""
+def rendered(folder: Path, heights_mm: tuple[float, float] = HEIGHTS_MM) -> Scene:
+    """Read a rendered scene."""
     truth = SceneTruth(folder)
     cameras = read_cameras(folder)
     names = [*("left", "right"), *(name for name in cameras if name not in ("left", "right"))]
@@ -121,20 +126,19 @@ def rendered(
     checks["open_px"] = float(np.median(spread)) if len(spread) else float("nan")
     unlimited = [np.inf, np.inf]
     volume = np.array([[-np.inf, -np.inf, heights_mm[0]], [*unlimited, heights_mm[1]]])
-    rows = np.arange(0, len(edges), every)
     return Scene(
         name=folder.name,
         images=images,
         cameras=tuple(cameras[name] for name in names),
         volume_mm=volume,
-        xy_px=edges.xy_px[rows],
-        truth=known.select(rows),
+        xy_px=edges.xy_px,
+        truth=known,
         checks=checks,
         of_points=truth.of,
     )
 
 
-def speckled_plate(folder: Path) -> Scene:
+def speckled_plate(folder: Path, *, whole: bool = False) -> Scene:
     """Read dice-gt4-stereo: seeds on the speckle of a real plate and their gold matches."""
     document: dict[str, Any] = json.loads((folder / "calibration.json").read_text(encoding="utf-8"))
     cameras = tuple(_vic_camera(entry) for entry in document["cameras"])
@@ -148,21 +152,49 @@ def speckled_plate(folder: Path) -> Scene:
     xyz = triangulate_linear(true_rig(cameras, everywhere), seen, np.ones(seen.shape[:2], bool))
     volume = np.array([[-np.inf] * 3, [np.inf] * 3])
     volume[0, 2], volume[1, 2] = xyz[:, 2].min() - PLATE_SLACK_MM, xyz[:, 2].max() + PLATE_SLACK_MM
-    return Scene(
+    images = tuple(_grey(folder / f"gt4_cam{i}.png") for i in (0, 1))
+    scene = Scene(
         name="dice-gt4-stereo",
-        images=tuple(_grey(folder / f"gt4_cam{i}.png") for i in (0, 1)),
+        images=images,
         cameras=cameras,
         volume_mm=volume,
         xy_px=first,
         truth=_all_visible(xyz, second),
         heights=False,
     )
+    return scene if whole else _middle(scene, PLATE_CROP_PX)
 
 
-def aloe(folder: Path, *, every: int = 1) -> Scene:
+def _middle(scene: Scene, size: tuple[int, int]) -> Scene:
+    """Keep the middle of both images: of the first its centre, of the second what matches it."""
+    first = scene.xy_px - np.array(scene.cameras[0].size_px) / 2
+    inner = np.abs(first).max(axis=1) < min(size) / 4
+    centres = [scene.xy_px[inner].mean(axis=0), scene.truth.xy_px[inner].mean(axis=0)]
+    corners = [np.rint(centre - np.array(size) / 2).astype(int) for centre in centres]
+    images, cameras = [], []
+    for image, camera, (x, y) in zip(scene.images, scene.cameras, corners, strict=True):
+        images.append(np.ascontiguousarray(image[y : y + size[1], x : x + size[0]]))
+        matrix = camera.matrix_px.copy()
+        matrix[:2, 2] -= x, y
+        cameras.append(replace(camera, size_px=size, matrix_px=matrix))
+    places = [scene.xy_px - corners[0], scene.truth.xy_px - corners[1]]
+    rows = np.all([((p > 10) & (p < np.array(size) - 10)).all(axis=1) for p in places], axis=0)
+    truth = replace(scene.truth.select(rows), xy_px=places[1][rows])
+    return replace(
+        scene,
+        name=f"{scene.name}, middle {size[0]} x {size[1]}",
+        images=tuple(images),
+        cameras=tuple(cameras),
+        xy_px=places[0][rows],
+        truth=truth,
+    )
+
+
+def aloe(folder: Path, *, whole: bool = False) -> Scene:
     """Read the rectified pair; truth is the map's nearer surface within a pixel."""
-    images = tuple(_grey(folder / f"aloe{side}.jpg") for side in "LR")
-    disparity = _grey(folder / "aloeGT.png").astype(np.float64)
+    rows = slice(None) if whole else ALOE_ROWS
+    images = tuple(np.ascontiguousarray(_grey(folder / f"aloe{side}.jpg")[rows]) for side in "LR")
+    disparity = _grey(folder / "aloeGT.png").astype(np.float64)[rows]
     height, width = disparity.shape
     known = disparity[disparity > 0]
     matrix = np.array(
@@ -192,15 +224,13 @@ def aloe(folder: Path, *, every: int = 1) -> Scene:
     kind = np.where(visible[row, column] & inside, int(Kind.edge), int(Kind.occluded))
     kind[value == 0] = int(Kind.unknown)
     xyz = np.full((len(value), 3), np.nan)
-    rows = np.arange(0, len(edges), every)
-    truth = PointTruth(kind.astype(np.int64), xyz, second, np.zeros(len(value)))
     return Scene(
-        name="opencv-pairs/aloe",
+        name="opencv-pairs/aloe" + ("" if whole else f", rows {rows.start} to {rows.stop - 1}"),
         images=images,
         cameras=cameras,
         volume_mm=volume,
-        xy_px=edges.xy_px[rows],
-        truth=truth.select(rows),
+        xy_px=edges.xy_px,
+        truth=PointTruth(kind.astype(np.int64), xyz, second, np.zeros(len(value))),
         right_px=1.5,
         heights=False,
     )

@@ -6,13 +6,16 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from matching.measures import Figures, Stage
 from matching.keypoints import keypoint_summary
+from matching.measures import Figures, Stage
 from matching.methods import OURS
 from matching.run import Result
 from matching.scene_truth import Kind
 from matching.scenes import Scene
 from thesis.tables import Lines, fixed, markdown
+
+MANY = 100
+"""Points on smooth surfaces from which on they are reported: prints, not a few shadows."""
 
 RIGHT_HEADER = (
     "method",
@@ -21,7 +24,7 @@ RIGHT_HEADER = (
     "left-right: precision / recall %",
     "kept: precision / recall %",
     "0.1 px %",
-    "median px",
+    "median px, all / along the curve",
     "height median / p95 mm",
     "wrong faces",
     "95 % region holds, px / mm %",
@@ -31,6 +34,7 @@ COST_HEADER = (
     "ms",
     "10-90 %, ms",
     "us per point",
+    "one way",
     "memory MB",
     "time ratio",
     "share within {px} px, ratio",
@@ -53,12 +57,16 @@ def tables(scene: Scene, results: Sequence[Result]) -> Lines:
         if result.tail and result.method.startswith(OURS):
             t = result.tail
             text.append(
-                f"{result.method}: {t['outside']} of {t['of']} kept points lie outside of their 95 % "
-                f"region; of these {t['wrong']} are off by more than {px} px, {t['truth_open']} "
+                f"{result.method}: {t['outside']} of {t['of']} kept points lie outside of their 95 "
+                f"% region; of these {t['wrong']} are off by more than {px} px, {t['truth_open']} "
                 f"lie where the truth itself is open by more than 0.1 px, {t['beyond_3_sigma']} "
                 f"are beyond three standard deviations (median {t['median_std_um_px'] / 1000} px)."
             )
             text.append("")
+    if f_surface := [r for r in ran if r.figures and r.figures.surface >= MANY]:
+        text.append("On smooth surfaces (print, shadow, shading; they may move with the light):")
+        text += [f"- {r.method}: kept {_pair(r.figures.surface_final)} %" for r in f_surface]
+        text.append("")
     if any(result.method.startswith("SIFT") for result in ran):
         text.append(keypoint_summary(scene))
     text += [f"{result.method}: {result.reason}" for result in results if not result.figures]
@@ -68,14 +76,16 @@ def tables(scene: Scene, results: Sequence[Result]) -> Lines:
 def legend() -> Lines:
     """Say how the columns are meant."""
     return [
-        "First two columns: before filters, of the points on surface edges that both views see. "
-        "Precision: right among kept, occluded points counted as wrong; recall: kept and right "
-        "among visible. Heights: along world Z, of kept visible points. A wrong face is a "
-        f"connected piece of more than 30 kept points that are all wrong. Ratios: to {OURS}; "
-        "share above 1 is better, time and height above 1 is worse. SGBM's and SIFT's own checks "
-        "stand for a left-right check. SIFT: a point takes the depth of the nearest keypoint match "
-        "within 4 px. ZNCC and the literal matcher are matched back, and must return within "
-        "1.5 px.",
+        (
+            "First two columns: before filters, of the points on surface edges that both views "
+            "see. Precision: right among kept, occluded points counted as wrong; recall: kept and "
+            "right among visible. Heights: along world Z, of kept visible points. A wrong face is "
+            "a connected piece of more than 30 kept points that are all wrong. Ratios: to "
+            f"{OURS}; share above 1 is better, time and height above 1 is worse. SGBM's and SIFT's "
+            "own checks stand for a left-right check. SIFT: a point takes the depth of the nearest "
+            "keypoint match within 4 px. ZNCC and the literal matcher are matched back, and must "
+            "return within 1.5 px."
+        ),
         "",
     ]
 
@@ -90,10 +100,10 @@ def _points(scene: Scene) -> Lines:
     if scene.checks:
         c = scene.checks
         text.append(
-            f"Check of the truth: {100 * c['hidden']:.1f} % of the visible edge points are hidden in "
-            f"the second view's depth map; {100 * c['no_edge']:.1f} % have no edge of the second "
-            f"image within 1.5 px, the others one at {c['median_px']:.2f} px (half a step along the "
-            f"chain is 0.25 px); the truth is open by {c['open_px']:.2f} px (median)."
+            f"Check of the truth: {100 * c['hidden']:.1f} % of the visible edge points are hidden "
+            f"in the second view's depth map; {100 * c['no_edge']:.1f} % have no edge of the "
+            f"second image within 1.5 px, the others one at {c['median_px']:.2f} px (half a step "
+            f"along the chain is 0.25 px); the truth is open by {c['open_px']:.2f} px (median)."
         )
     return text
 
@@ -106,7 +116,7 @@ def _right(result: Result, f: Figures) -> list[str]:
         _pair(f.checked),
         _pair(f.final),
         _percent(f.final.within_fine),
-        fixed(f.median_px, 3),
+        f"{fixed(f.median_px, 3)} / {fixed(f.median_along_px, 3)}",
         f"{fixed(f.height_median, 3)} / {fixed(f.height_p95, 3)}",
         str(f.wrong_faces),
         f"{_percent(f.cover_px)} / {_percent(f.cover_mm)}",
@@ -121,6 +131,7 @@ def _cost(result: Result, f: Figures, ours: Result | None) -> list[str]:
         fixed(1000 * result.median_s, 0),
         f"{low:.0f}-{high:.0f}",
         fixed(result.us_per_point, 0),
+        fixed(1e6 * result.one_way_s / max(f.points, 1), 1),
         fixed(result.memory_mb, 0),
         fixed(_over(result.median_s, ours.median_s if ours else np.nan), 2),
         fixed(_over(f.raw, base.raw if base else np.nan), 3),

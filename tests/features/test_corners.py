@@ -42,12 +42,12 @@ def test_corners_of_turned_squares_lie_where_they_were_drawn():
     assert np.mean(np.array(squared) < 5.99) >= 0.9
 
 
-def test_a_blunt_and_a_sharp_corner_are_found():
-    triangle = np.array([[20.3, 98.2], [118.7, 101.4], [62.1, 62.6]])
-    found = corners_of(polygon(triangle, seed=3))
-    apart = np.linalg.norm(found.xy_px[:, None] - triangle, axis=2).min(axis=0)
-    assert apart[2] < 0.4
-    assert (apart[:2] < 1.0).any()
+def test_blunt_corners_are_found_and_sharp_ones_left_out():
+    """Between arms at 40 degrees the blur of each moves the other: such a corner is not stated."""
+    roof = np.array([[14.3, 88.2], [70.1, 50.6], [124.7, 91.4]])
+    found = corners_of(polygon(roof, seed=3))
+    assert len(found) == 1
+    assert np.linalg.norm(found.xy_px[0] - roof[1]) < 0.2
 
 
 def test_circles_bars_and_noise_have_no_corners():

@@ -151,19 +151,24 @@ def test_nothing_is_made_up():
 
 def test_a_match_that_does_not_return_is_flagged():
     cameras = _pair()
+    seed = np.array([[150.0, 130.0]])
+    rng = np.random.default_rng(2)
     first = np.zeros(SIZE[::-1], np.bool_)
-    second = first.copy()
-    # what the seed's element would need is not in view 2; something of it is
-    first[120:141, 150] = True
-    first[125, 140:161] = True
-    row, column = 133, 160
-    second[row - 30 : row + 30, column - 20] = True
-    first[100:160, 200] = True
-    found = match_with_best_element(cameras, (first, second), [[150.0, 130.0]], VOLUME)
+    whole = rng.random((15, 15)) < 0.4
+    # around the seed a part of a pattern that is whole elsewhere in view 1, on the same plane
+    # of sight: view 2 shows the whole one, to which the part fits and which fits the whole
+    first[123:138, 143:158] = whole & (rng.random((15, 15)) < 0.5)
+    first[130, 150] = True
+    first[123:138, 163:178] = whole
+    second = np.zeros_like(first)
+    there = upper_plane_mapping(*cameras, [[170.0, 130.0]], 0.0).xy_px[0]
+    column, row = np.rint(there).astype(int)
+    second[row - 7 : row + 8, column - 7 : column + 8] = whole
+    kinds = (("square", 15), ("disc", 15))
+    found = match_with_best_element(cameras, (first, second), seed, VOLUME, elements=kinds)
     assert np.isfinite(found.matches.xy_px).all()
-    if not found.returns[0, found.element[0]]:
-        assert found.matches.flags[0] & Flag.inconsistent
-    assert bool(found.matches.flags[0] & Flag.inconsistent) == (not found.returns[0].any())
+    assert not found.returns.any()
+    assert found.matches.flags[0] & Flag.inconsistent
 
 
 def test_progress_and_bad_elements():
@@ -179,6 +184,8 @@ def test_progress_and_bad_elements():
         progress=lambda done, total: told.append((done, total)),
     )
     assert told == [(1, 2), (2, 2)]
+    with pytest.raises(InputError, match="no element"):
+        match_with_best_element(cameras, (first, first), [[150.0, 130.0]], VOLUME, elements=())
     for kind in (("disc", 8), ("strip", 1), ("star", 9)):
         with pytest.raises(InputError):
             match_with_best_element(

@@ -9,7 +9,7 @@ from closerange.matching.candidates import sweep_axis
 from closerange.matching.literal import (
     LiteralMatcher,
     binary_images,
-    match_literally,
+    match_literal,
 )
 from closerange.matching.literal_band import bands
 from closerange.matching.literal_element import farthest_plane, footprint, strip_footprint
@@ -20,7 +20,12 @@ from closerange.matching.literal_words import (
     pack_blocks,
 )
 from closerange.matching.pencil import Pencil
-from closerange.matching.search import between_planes, epipolar_segment, upper_plane_mapping
+from closerange.matching.search import (
+    between_planes,
+    epipolar_segment,
+    sight_line,
+    upper_plane_mapping,
+)
 from closerange.rig.camera import Camera
 from closerange.rig.distortion import BrownIdeal
 from closerange.verification.scenes import looking_at_origin
@@ -219,7 +224,7 @@ def test_the_band_is_what_its_definition_says(lens, band):
     for roll in (0.3, 1.4, -2.0):
         cameras = _pair(lens, roll=roll)
         seeds = _seeds(20)
-        found = bands(cameras, seeds, VOLUME, band)
+        found = bands(cameras[1], sight_line(cameras[0], seeds, VOLUME), band)
         total = 0
         for row, seed in enumerate(seeds):
             got = list(zip(found.column[row], found.row[row], strict=True))
@@ -249,7 +254,8 @@ def test_counts_equal_brute_force_exactly(lens, inside, share):
     cameras, masks = _pair(lens, roll=0.4), _random_masks(share)
     matcher = LiteralMatcher(cameras, masks, VOLUME, band_px=1.0)
     seeds = _seeds(12)
-    elements, places = matcher.elements(seeds, inside), matcher.bands(seeds)
+    search = matcher.search(seeds)
+    elements, places = matcher.elements(search, inside), search.places
     hits = matcher.scan(elements, places)
     found = matcher.match(seeds, inside)
     compared = 0
@@ -388,7 +394,7 @@ def test_blank_and_saturated_images_have_no_edges(level, original):
     image[60:100, 80:120] = 200 if level < 100 else 20
     assert not binary_images((blank, blank), original=original)[0].any()
     for pair in ((blank, image), (blank, blank), (image, blank)):
-        found = match_literally(pair, _pair(), [[80, 80], [100, 60]], VOLUME, original=original)
+        found = match_literal(pair, _pair(), [[80, 80], [100, 60]], VOLUME, original=original)
         assert np.isnan(found.xy_px).all()
         assert (found.flags == Flag.no_edge).all()
 
@@ -422,7 +428,7 @@ def test_ties_choose_the_middle_and_are_flagged_when_apart():
     cameras = _pair()
     first = np.zeros(SIZE[::-1], np.bool_)
     first[80, 100] = True  # one pixel
-    places = bands(cameras, np.array([[100.0, 80.0]]), VOLUME, 0.5)
+    places = bands(cameras[1], sight_line(cameras[0], [[100.0, 80.0]], VOLUME), 0.5)
     line = [(int(y), int(x)) for y, x in zip(places.row[0], places.column[0], strict=True)]
     assert places.valid[0].all()
 
@@ -466,9 +472,7 @@ def test_oversized_elements_are_refused():
         matcher.match([[100, 80]], np.ones((161, 161), np.bool_))
     matcher.match([[100, 80]], np.ones((159, 159), np.bool_))
     with pytest.raises(InputError, match="161 px"):
-        match_literally(
-            [np.zeros(SIZE[::-1], np.uint8)] * 2, _pair(), [[1, 1]], VOLUME, size_px=161
-        )
+        match_literal([np.zeros(SIZE[::-1], np.uint8)] * 2, _pair(), [[1, 1]], VOLUME, side_px=161)
 
 
 def test_an_element_that_view_2_magnifies_beyond_its_image_is_flagged():
@@ -494,7 +498,7 @@ def test_images_of_another_size_are_refused():
         LiteralMatcher(_pair(), (good, wrong), VOLUME)
     grey = np.zeros(SIZE, np.uint8)
     with pytest.raises(InputError, match="'left' has 160x200 px"):
-        match_literally((grey, grey), _pair(), [[1, 1]], VOLUME)
+        match_literal((grey, grey), _pair(), [[1, 1]], VOLUME)
 
 
 @pytest.mark.parametrize("band", [0.0, 0.4, np.nan, 1001.0])
@@ -519,7 +523,9 @@ def test_matches_become_rows():
     assert rows.placement == ("p", "p", "p")
     assert rows.mismatch[0] == found.mismatch[0]
     assert rows.matched.tolist() == [True, False, False]
-    assert np.isnan(rows.cov_px2).all()
+    assert np.isnan(rows.cov_px2[:, 0]).all()  # the seed's own is not known here
+    assert np.array_equal(rows.cov_px2[0, 1], np.eye(2) / 3)
+    assert np.isnan(rows.cov_px2[1:, 1]).all()
     assert rows.flags[1].tolist() == [Flag.not_found, Flag.not_found]
     assert rows.xy_px[2, 0].tolist() == [-5, 3]
     assert len(rows.to_image_points()) == 6

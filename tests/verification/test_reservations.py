@@ -47,7 +47,7 @@ def readings(*, count=COUNT, flagged=0, seed=0, dof=None):
     return positions, truth
 
 
-def tested(positions, truth, limits=LIMITS):
+def judged(positions, truth, *, limits=LIMITS):
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", CloseRangeWarning)
         return single_point_test(positions, truth, limits=limits)
@@ -58,7 +58,7 @@ def sentence(result):
 
 
 def test_a_whole_test_is_accepted():
-    report = tested(*readings())
+    report = judged(*readings())
     assert (report.decision, report.reservations, report.hollow) == ("accept", (), "")
     assert sentence(report).tone == "good"
 
@@ -71,7 +71,7 @@ def test_exchanged_cameras_leave_six_readings_that_are_not_accepted():
         positions.placement, positions.point, positions.xyz_mm, positions.cov_mm2,
         positions.residual_px, positions.cameras, np.where(good, 0, BAD), positions.reading,
     )  # fmt: skip
-    report = tested(flagged, truth, Limits.of(accuracy_mm=1.0))
+    report = judged(flagged, truth, limits=Limits.of(accuracy_mm=1.0))
     assert [item.decision for item in report.judgements] == ["accept"] * 3
     assert report.decision == "undecided"
     assert report.reservations == (
@@ -82,11 +82,11 @@ def test_exchanged_cameras_leave_six_readings_that_are_not_accepted():
     text = sentence(report).text
     assert text.startswith("Undecided: 264 of 270 readings are flagged and were left out; 84 of 90")
     # without limits there is a decision too: that nothing can be said
-    assert tested(flagged, truth, None).decision == "undecided"
+    assert judged(flagged, truth, limits=None).decision == "undecided"
 
 
 def test_one_flagged_reading_is_enough_to_leave_it_undecided():
-    report = tested(*readings(flagged=1))
+    report = judged(*readings(flagged=1))
     assert report.decision == "undecided"
     assert report.reservations == ("1 of 270 readings are flagged and were left out",)
     assert report.not_measured == ()
@@ -95,7 +95,7 @@ def test_one_flagged_reading_is_enough_to_leave_it_undecided():
 
 
 def test_a_truth_that_was_never_measured_is_enough():
-    report = tested(*readings(count=89))
+    report = judged(*readings(count=89))
     assert report.decision == "undecided"
     assert report.not_measured == (("", "p89"),)
 
@@ -103,18 +103,18 @@ def test_a_truth_that_was_never_measured_is_enough():
 def test_a_reading_without_a_truth_is_enough():
     positions, truth = readings()
     shorter = ControlPoints.of(truth.point[:-1], truth.xyz_mm[:-1])
-    report = tested(positions, shorter)
+    report = judged(positions, shorter)
     assert report.decision == "undecided"
     assert report.reservations == ("3 readings have no actual position",)
 
 
 def test_what_was_left_out_does_not_save_from_rejection():
-    report = tested(*readings(flagged=1), Limits.of(accuracy_mm=1e-4))
+    report = judged(*readings(flagged=1), limits=Limits.of(accuracy_mm=1e-4))
     assert report.decision == "reject"
 
 
 def test_without_limits_the_sentence_says_what_was_left_out():
-    report = tested(*readings(flagged=1), None)
+    report = judged(*readings(flagged=1), limits=None)
     assert report.decision is None
     found = sentence(report)
     assert "no limits were agreed; but 1 of 270 readings are flagged" in found.text
@@ -128,7 +128,7 @@ def test_a_truth_for_all_placements_counts_when_its_point_is_measured_in_one():
         ("s", "s"), ("a", "a"), [[1, 0, 0], [1, 0.01, 0]], np.full((2, 3, 3), np.nan),
         np.zeros(2), [2, 2], [0, 0], ("1", "2"),
     )  # fmt: skip
-    assert tested(positions, truth).not_measured == ()
+    assert judged(positions, truth).not_measured == ()
 
 
 @pytest.mark.parametrize(("flagged", "hollow"), [(135, False), (136, True)])
@@ -184,15 +184,9 @@ def test_the_table_gives_the_same_region_as_the_positions(tmp_path):
     """With 4 degrees of freedom the region is 2.5 times as large as with a known variance."""
     positions, truth = readings(dof=4, seed=3)
     positions.to_csv(tmp_path / "p.csv")
-    known = readings(seed=3)[0]
-    here, there, other = (
-        tested(rows, truth).coverage
-        for rows in (positions, read_positions(tmp_path / "p.csv"), known)
-    )
+    tables = (positions, read_positions(tmp_path / "p.csv"), readings(seed=3)[0])
+    here, there, other = (judged(rows, truth).coverage for rows in tables)
     assert (here.inside, here.count) == (there.inside, there.count)
     assert here.inside > other.inside or other.inside == other.count
-    control = [
-        compare_with_control(rows, truth).coverage["all"].inside
-        for rows in (positions, read_positions(tmp_path / "p.csv"), known)
-    ]
+    control = [compare_with_control(rows, truth).coverage["all"].inside for rows in tables]
     assert control[0] == control[1] > control[2]

@@ -124,6 +124,13 @@ def test_a_rig_that_must_not_be_believed(tmp_path):
     assert "untrustworthy" in report(tmp_path / "rig.json")
 
 
+@pytest.mark.parametrize("free_poses", [False, True])
+def test_a_volume_of_three_numbers_is_refused(seen, free_poses):
+    points, control = seen
+    with pytest.raises(InputError, match="is not two corners of three finite numbers"):
+        calibrate(points, control=control, free_poses=free_poses, volume_mm=[1, 2, 3])
+
+
 def test_free_poses_of_a_chessboard():
     """Eight unknown poses of a board; the world is the board of the first one."""
     board = Target.of(Chessboard(6, 9, 15.0))
@@ -141,6 +148,11 @@ def test_free_poses_of_a_chessboard():
         total = points if total is None else total + points
     rig = calibrate(total, control=control, model="brown", free_poses=True)
     assert rig.trusted
+    assert rig.provenance["options"] == {"model": "brown", "volume_mm": None, "free_poses": True}
+    stated = [[-10.0, -10, -10], [10, 10, 10]]
+    small = calibrate(total, control=control, free_poses=True, volume_mm=stated)
+    np.testing.assert_array_equal(small.volume_mm, stated)
+    assert small.provenance["options"]["volume_mm"] == stated
     assert rig.noise_px == pytest.approx(0.02, rel=0.2)  # known to 2 % from 1728 residuals
     positions = measure(rig, total.select([name == "p5" for name in total.placement]))
     truth = poses[5].apply(board.xyz_mm)[control.rows_for(positions.placement, positions.point)]

@@ -7,11 +7,10 @@ import shutil
 from importlib.resources import files
 from pathlib import Path
 
-import numpy as np
 import pytest
 
 from closerange.apps.cli.screens import run_failure, run_summary, run_text
-from closerange.position.suspicion import DoubtWarning
+from closerange.flags import Flag
 from closerange.workflows.run import run
 
 DEMO = Path(str(files("closerange.workflows") / "demo_data"))
@@ -96,14 +95,15 @@ def test_the_program_s_own_time_is_measured_and_limited_where_asked_for(project)
     assert "ms a reading, images on disk to position" in run_text(done)
 
 
-def test_exchanged_images_are_said_and_undecided_with_all_files_written(project):
+def test_exchanged_images_are_said_and_all_files_are_written(project):
     done = run(project("limits = { accuracy_mm = 500.0 }", exchanged=True))
-    positions = done.jobs[0].positions
-    assert np.mean(positions.flags != 0) > 0.5
+    (job,) = done.jobs
+    assert (job.positions.flags & int(Flag.residual)).all()
+    assert job.result is None  # nothing is left to be compared
     failure = run_failure(done)
     assert failure is not None
-    assert failure.exit_code == 1
-    assert result_of(done)["decision"] == "undecided"
+    assert (failure.exit_code, "contradict the rig" in failure.message) == (1, True)
     assert done.report.is_file()
-    assert any("exchanged" in text for text in done.warnings)
-    assert issubclass(DoubtWarning, Warning)
+    assert (done.folder / "test-positions.csv").is_file()
+    assert any("'left' as 'right', 'right' as 'left', 9 of 9" in text for text in done.warnings)
+    assert any("'test' is not verified" in text for text in done.warnings)

@@ -55,9 +55,7 @@ class OpenCvView:
         self, turn: FloatArray, matrix: FloatArray, size: tuple[int, int]
     ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
         """Return maps for `cv2.remap` into a turned camera without lens."""
-        x, y = cv2.initUndistortRectifyMap(
-            self.matrix, self.lens, turn, matrix, size, cv2.CV_32FC1
-        )
+        x, y = cv2.initUndistortRectifyMap(self.matrix, self.lens, turn, matrix, size, cv2.CV_32FC1)
         return x + np.float32(self._shear) * (y - np.float32(self.matrix[1, 2])), y
 
     def _sheared(self, xy: FloatArray, sense: float) -> FloatArray:
@@ -82,7 +80,7 @@ def on_plane(view: OpenCvView, xy: FloatArray, axis: int, height: FloatArray) ->
 def sweep_heights(
     views: tuple[OpenCvView, OpenCvView], xy: FloatArray, axis: int, volume: FloatArray
 ) -> FloatArray:
-    """Return plane heights that lie 1 px apart in the second view, for the point of median place."""
+    """Return plane heights 1 px apart in the second view, for the median point."""
     low, high = volume[:, axis]
     middle = np.median(xy, axis=0)[None]
     # evenly in 1 / distance a point moves evenly in the image

@@ -1,9 +1,10 @@
 """OpenCV's semi-global matching on rectified images, all eight paths (``MODE_HH``).
 
 `cv2.stereoRectify` gives the turns; the window of the rectified images holds all points and all
-places where they may be, at the first image's resolution. Disparities are looked up at the rounded place of each point and
-mapped back. Block and penalties as OpenCV's examples have them, and its own checks (uniqueness,
-left-right, speckles) on. H. Hirschmueller, 2008, doi:10.1109/TPAMI.2007.1166.
+places where they may be, at the first image's resolution. Disparities are looked up at the rounded
+place of each point and mapped back. Block and penalties as OpenCV's examples have them, and its
+own checks (uniqueness, left-right, speckles) on. H. Hirschmueller, 2008,
+doi:10.1109/TPAMI.2007.1166.
 """
 
 from __future__ import annotations
@@ -62,7 +63,7 @@ def match(
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Pair:
-    """Turns and matrices of both rectified cameras, their image size; is the pair upright?"""
+    """Turns and matrices of both rectified cameras, their size, are rows columns."""
 
     turns: list[FloatArray]
     matrices: list[FloatArray]
@@ -117,9 +118,7 @@ def _disparity(rectified: list[NDArray[np.uint8]], low: int, high: int) -> Float
     )
     # OpenCV leaves out columns whose search would leave the image
     pad = max(abs(low), abs(low + count)) + BLOCK
-    wide = [
-        cv2.copyMakeBorder(image, 0, 0, pad, pad, cv2.BORDER_REPLICATE) for image in rectified
-    ]
+    wide = [cv2.copyMakeBorder(image, 0, 0, pad, pad, cv2.BORDER_REPLICATE) for image in rectified]
     found = np.asarray(matcher.compute(*wide), np.float64) / 16
     return found[:, pad:-pad]
 

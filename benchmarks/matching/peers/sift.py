@@ -14,6 +14,7 @@ from typing import Any
 import cv2
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial import cKDTree
 
 from matching.peers.opencv_view import OpenCvView, on_plane, sweep_axis
 
@@ -38,9 +39,8 @@ def match(
     if len(first):
         axis = sweep_axis(views)
         height = _triangulated(views, first, second)[:, axis]
-        away = np.linalg.norm(points_px[:, None] - first[None], axis=2)
-        nearest = away.argmin(axis=1)
-        near = away.min(axis=1) <= REACH_PX
+        away, nearest = cKDTree(first).query(points_px)
+        near = away <= REACH_PX
         point = on_plane(views[0], points_px[near], axis, height[nearest[near]])
         found[near] = views[1].project(point)
     return found, np.isfinite(found).all(axis=1)

@@ -88,7 +88,7 @@ def _what(contents: Contents) -> str:
     """Name what was calibrated, measured and compared."""
     texts = []
     for check in contents.checks:
-        count = len(check["rows"]["flags"])
+        count = len(check["rows"].get("flags", ()))
         if check["kind"] == "single-point":
             each = numbers(check["rows"]["count"])
             readings = _range(each) if each.size else "no"
@@ -97,6 +97,8 @@ def _what(contents: Contents) -> str:
             texts.append(counted(count, "control point"))
     lengths = sum(len(check["rows"]["flags"]) for check in contents.checks_of("lengths"))
     texts += [counted(lengths, "known length")] if lengths else []
+    heights = sum(sum(check["rows"]["used"]) for check in contents.checks_of("heights"))
+    texts += [counted(heights, "known height")] if heights else []
     if not texts and contents.positions:
         count = sum(len(positions) for positions in contents.positions.values())
         texts.append(counted(count, "position"))
@@ -135,6 +137,12 @@ def _how_accurate(contents: Contents) -> str:
     if used:
         largest_length = short_length(float(np.abs(used).max()))
         texts.append(f"Error of a length: at most {largest_length}.")
+    for check in contents.checks_of("heights"):
+        largest_height = short_length(float(numbers(check["max_mm"])))
+        median = short_length(float(numbers(check["points_median_mm"])))
+        job = f" ({check['job']})" if check.get("job") else ""
+        single = f"of a single point {median} (median)"
+        texts.append(f"Error of a height{job}: at most {largest_height}; {single}.")
     trust = contents.rig.trust if contents.rig is not None else None
     if trust is not None and not texts:
         texts.append(f"Predicted standard deviation {three_micrometres(trust.predicted_mm)}.")
@@ -219,7 +227,12 @@ def _from_lengths(contents: Contents) -> Iterator[Reason]:
 
 def _from_rows(contents: Contents) -> Iterator[Reason]:
     """Count what is defective or missing."""
-    flags = [positions.flags for positions in contents.positions.values() if len(positions)]
+    # of a matched scene points are left out by the thousand, and are meant to be
+    flags = [
+        positions.flags
+        for job, positions in contents.positions.items()
+        if len(positions) and job not in contents.matches
+    ]
     if flags:
         flagged = int((np.concatenate(flags) != 0).sum())
         total = sum(len(each) for each in flags)
@@ -228,6 +241,10 @@ def _from_rows(contents: Contents) -> Iterator[Reason]:
             yield Reason(text, "against")
         else:
             yield Reason(f"no flag on any of {counted(total, 'measured position')}", "for")
+    for job, matches in contents.matches.items():
+        kept, of_job = int(matches.clean.sum()), f" of job {job}" if job else ""
+        text = f"{kept} of {counted(len(matches), 'matched point')}{of_job} carry no flag; only"
+        yield Reason(f"{text} these are used", "note")
     reserved = [text for check in contents.checks for text in check.get("reservations") or ()]
     yield from (Reason(text, "against") for text in dict.fromkeys(reserved))
     others = [check for check in contents.checks if not check.get("reservations")]

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from closerange.delivery.excerpts import four, left_out, listed, numbers, shown
+from closerange.delivery.heights_section import height_blocks
 from closerange.delivery.plots import Level, Panel, panel_grid
 from closerange.delivery.sheet import Block, Figure, Paragraph, Section, Table
 from closerange.delivery.single_point_section import single_point_blocks
@@ -43,7 +44,12 @@ def check_sections(checks: Iterable[Mapping[str, Any]]) -> list[Section]:
     list of Section
         In the order given.
     """
-    writers = {"single-point": single_point_blocks, "control": _control, "lengths": _lengths}
+    writers = {
+        "single-point": single_point_blocks,
+        "control": _control,
+        "lengths": _lengths,
+        "heights": height_blocks,
+    }
     sections = []
     for number, check in enumerate(checks, start=1):
         writer = writers.get(str(check.get("kind")))

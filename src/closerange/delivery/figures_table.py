@@ -44,6 +44,7 @@ def figures_table(contents: Contents) -> Table | None:
         ("single-point", _single_point_rows),
         ("control", _control_rows),
         ("lengths", _length_rows),
+        ("heights", _height_rows),
     ):
         checks = contents.checks_of(kind)
         for check in checks:
@@ -136,6 +137,22 @@ def _length_rows(check: Mapping[str, Any]) -> list[tuple[str, ...]]:
         (f"Error of {counted(used, 'length')} (rms)", "", "", "", rms, "µm", DASH, DASH, DASH),
         ("Error of a length (largest)", "", "", "", largest, "µm", DASH, DASH, DASH),
     ]
+
+
+def _height_rows(check: Mapping[str, Any]) -> list[tuple[str, ...]]:
+    rows = check["rows"]
+    used = sum(rows["used"])
+    points = sum(count for count, use in zip(rows["count"], rows["used"], strict=True) if use)
+    rms, largest = (micrometres(float(numbers(check[name]))) for name in ("rms_mm", "max_mm"))
+    median = micrometres(float(numbers(check["points_median_mm"])))
+    single = f"Error of {counted(points, 'point')} on tops (median)"
+    found: list[tuple[str, ...]] = [
+        (f"Error of {counted(used, 'height')} (rms)", "", "", "", rms, "µm", DASH, DASH, DASH),
+        ("Error of a height (largest)", "", "", "", largest, "µm", DASH, DASH, DASH),
+    ]
+    return (
+        [*found, (single, "", "", median, "", "µm", DASH, DASH, DASH)] if points > used else found
+    )
 
 
 def _coverage_rows(coverage: Mapping[str, Any]) -> list[tuple[str, ...]]:

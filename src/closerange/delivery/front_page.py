@@ -148,6 +148,13 @@ def _from_checks(contents: Contents) -> Verdict | None:
             f"largest {short_length(largest)}"
         )
         return _reserved(text, check, _trust_tone(contents))
+    for check in contents.checks_of("heights"):
+        rms, largest = (float(numbers(check[name])) for name in ("rms_mm", "max_mm"))
+        text = (
+            f"{counted(sum(check['rows']['used']), 'height')}: rms error {short_length(rms)}, "
+            f"largest {short_length(largest)}"
+        )
+        return _reserved(text, check, _trust_tone(contents))
     return None
 
 

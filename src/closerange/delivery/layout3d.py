@@ -54,7 +54,7 @@ class Group:
     colours: Sequence[str]
 
 
-class _View:
+class ParallelView:
     """A parallel projection fitted to a box of the world.
 
     Z points up on paper, or down where the cameras look from below along +Z: what is nearer to
@@ -121,9 +121,9 @@ def draw_layout(rig: Rig, *, width: float = FULL_WIDTH) -> Markup:
         "Cameras and measuring volume",
         f"{len(rig.cameras)} cameras around the measuring volume, axes in mm",
     )
-    view = _View(low, high, (width, drawing.height - 26), up=_up(rig))
-    _axes_box(drawing, view)
-    _box(drawing, view, rig.volume_mm, PURPLE)
+    view = ParallelView(low, high, (width, drawing.height - 26), up=_up(rig))
+    draw_axes(drawing, view)
+    draw_box(drawing, view, rig.volume_mm, PURPLE)
     for camera, frustum in zip(rig.cameras, frusta, strict=True):
         _draw_camera(drawing, view, camera, frustum)
         ahead = camera.camera_from_world.rotation[2]
@@ -227,9 +227,9 @@ def _cloud(
     low, high = everything.min(axis=0), everything.max(axis=0)
     # a flat box would have no edges to carry the axes
     air = np.maximum(0.02 * (high - low), 0.04 * max(float((high - low).max()), 1e-6))
-    view = _View(low - air, high + air, (drawing.width, drawing.height - 26), up=up)
-    _axes_box(drawing, view)
-    _box(drawing, view, volume_mm, PURPLE)
+    view = ParallelView(low - air, high + air, (drawing.width, drawing.height - 26), up=up)
+    draw_axes(drawing, view)
+    draw_box(drawing, view, volume_mm, PURPLE)
     xyz = np.concatenate([np.empty((0, 3)), *(group.xyz_mm for group in groups)])
     colours = [
         group.colours[row if len(group.colours) > 1 else 0]
@@ -255,7 +255,7 @@ def _frustum(camera: Camera, depth_mm: float) -> FloatArray:
     return points
 
 
-def _draw_camera(drawing: Drawing, view: _View, camera: Camera, frustum: FloatArray) -> None:
+def _draw_camera(drawing: Drawing, view: ParallelView, camera: Camera, frustum: FloatArray) -> None:
     centre, *corners = (view(point) for point in frustum)
     drawing.path(corners, closed=True, fill=BLUE, fill_opacity="0.15", stroke=BLUE)
     for corner in corners:
@@ -264,7 +264,7 @@ def _draw_camera(drawing: Drawing, view: _View, camera: Camera, frustum: FloatAr
     drawing.text((centre[0], centre[1] - 8), camera.name, text_anchor="middle", font_weight="bold")
 
 
-def _axes_box(drawing: Drawing, view: _View) -> None:
+def draw_axes(drawing: Drawing, view: ParallelView) -> None:
     """Draw a grid on the floor and ticks in mm along one edge of each axis."""
     low, high, floor = view.low, view.high, view.floor_mm
     # the edges in front carry X and Y; the edge at the left end carries Z
@@ -284,18 +284,18 @@ def _axes_box(drawing: Drawing, view: _View) -> None:
     _height_line(drawing, view, min(corners, key=lambda corner: view(corner)[0]))
 
 
-def _axis_ticks(view: _View, axis: int) -> list[float]:
+def _axis_ticks(view: ParallelView, axis: int) -> list[float]:
     return ticks(float(view.low[axis]), float(view.high[axis]), _tick_count(view, axis))
 
 
-def _tick_count(view: _View, axis: int) -> int:
+def _tick_count(view: ParallelView, axis: int) -> int:
     """As many ticks as the edge's length on paper has room for."""
     span = float(view.high[axis] - view.low[axis])
     along = np.hypot(*view.axes[:2, axis]) * view.scale * span
     return max(2, min(6, int(along / 42)))
 
 
-def _axis_line(drawing: Drawing, view: _View, axis: int, place: float) -> None:
+def _axis_line(drawing: Drawing, view: ParallelView, axis: int, place: float) -> None:
     """Write ticks and the name of a horizontal axis along the front edge."""
     step = nice_step(float(view.high[axis] - view.low[axis]), _tick_count(view, axis))
     at = np.empty(3)
@@ -316,7 +316,7 @@ def _axis_line(drawing: Drawing, view: _View, axis: int, place: float) -> None:
     )
 
 
-def _height_line(drawing: Drawing, view: _View, corner: tuple[float, float, float]) -> None:
+def _height_line(drawing: Drawing, view: ParallelView, corner: tuple[float, float, float]) -> None:
     """Draw the upright axis with its ticks."""
     x, y, _ = corner
     start, end = view((x, y, view.low[2])), view((x, y, view.high[2]))
@@ -336,7 +336,7 @@ def _height_line(drawing: Drawing, view: _View, corner: tuple[float, float, floa
     )
 
 
-def _box(drawing: Drawing, view: _View, box_mm: FloatArray, colour: str) -> None:
+def draw_box(drawing: Drawing, view: ParallelView, box_mm: FloatArray, colour: str) -> None:
     """Draw the twelve edges of a box."""
     corners = _corners(box_mm[0], box_mm[1])
     for i in range(8):

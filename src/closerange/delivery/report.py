@@ -16,6 +16,8 @@ from closerange.delivery.facts import provenance_section
 from closerange.delivery.figures_table import figures_table
 from closerange.delivery.front_page import front_picture, verdict
 from closerange.delivery.glossary import glossary_section, words_in
+from closerange.delivery.match_pictures import ScenePictures
+from closerange.delivery.match_section import match_sections
 from closerange.delivery.overlays import Overlay
 from closerange.delivery.report_sections import (
     flags_section,
@@ -27,6 +29,7 @@ from closerange.delivery.sheet import Contents, Files, Paragraph, Section, Table
 from closerange.delivery.table_sections import points_section, positions_section
 from closerange.delivery.wording import printed
 from closerange.features.image_points import ImagePoints
+from closerange.matching.correspondences import Correspondences
 from closerange.position.positions import Positions
 from closerange.rig.rig import Rig
 from closerange.verification.error_map import ErrorMap
@@ -40,6 +43,8 @@ def render_report(  # noqa: PLR0913 - each argument is one thing that a report m
     points: ImagePoints | Mapping[str, ImagePoints] | None = None,
     overlays: Sequence[Overlay] = (),
     positions: Positions | Mapping[str, Positions] | None = None,
+    matches: Correspondences | Mapping[str, Correspondences] | None = None,
+    scenes: ScenePictures | Mapping[str, ScenePictures] | None = None,
     checks: Sequence[object] = (),
     error_map: ErrorMap | None = None,
     provenance: Mapping[str, Any] | None = None,
@@ -60,9 +65,13 @@ def render_report(  # noqa: PLR0913 - each argument is one thing that a report m
         Pictures with what was found on them; about 100 kB each.
     positions : Positions or mapping of str to Positions, optional
         Measured positions, likewise.
+    matches : Correspondences or mapping of str to Correspondences, optional
+        Matched points, likewise; their positions have the same names.
+    scenes : ScenePictures or mapping of str to ScenePictures, optional
+        Pictures of the matched scenes, likewise.
     checks : sequence of object, optional
-        Verification results (`ControlCheck`, `AcceptanceReport`, `LengthCheck`) or their stored
-        documents.
+        Verification results (`ControlCheck`, `AcceptanceReport`, `LengthCheck`, `HeightCheck`) or
+        their stored documents.
     error_map : ErrorMap, optional
         Predicted error in the volume.
     provenance : mapping, optional
@@ -84,6 +93,8 @@ def render_report(  # noqa: PLR0913 - each argument is one thing that a report m
         points={"": points} if isinstance(points, ImagePoints) else points or {},
         overlays=tuple(overlays),
         positions={"": positions} if isinstance(positions, Positions) else positions or {},
+        matches={"": matches} if isinstance(matches, Correspondences) else matches or {},
+        scenes={"": scenes} if isinstance(scenes, ScenePictures) else scenes or {},
         checks=documents_of(checks),
         error_map=error_map,
         provenance=provenance or {},
@@ -126,6 +137,7 @@ def _sections(contents: Contents) -> list[Section]:
         _notes_section(contents),
         measured_section(contents),
         *check_sections(contents.checks),
+        *match_sections(contents),
         prediction_section(contents),
         calibration_section(contents),
         positions_section(contents),

@@ -20,6 +20,7 @@ from closerange.delivery.wording import (
 from closerange.features.image_points import ImagePoints
 from closerange.flags import Flag
 from closerange.geometry.arrays import FloatArray
+from closerange.matching.correspondences import Correspondences
 from closerange.position.positions import Positions
 from closerange.rig.rig import Rig
 
@@ -40,9 +41,15 @@ def measured_section(contents: Contents) -> Section | None:
     blocks: list[Block] = []
     if contents.rig is not None:
         blocks += [Paragraph(_rig_sentence(contents.rig)), _cameras_table(contents.rig)]
-    jobs = dict.fromkeys((*contents.points, *contents.positions))
+    jobs = dict.fromkeys((*contents.points, *contents.positions, *contents.matches))
     sentences = [
-        _job_sentence(job, contents.points.get(job), contents.positions.get(job)) for job in jobs
+        _job_sentence(
+            job,
+            contents.points.get(job),
+            contents.positions.get(job),
+            contents.matches.get(job),
+        )
+        for job in jobs
     ]
     if sentences:
         blocks.append(Paragraph(" ".join(sentences)))
@@ -119,6 +126,7 @@ def flags_section(contents: Contents) -> Section | None:
     rig = contents.rig
     columns = {
         "image points": [points.flags for points in contents.points.values()],
+        "matched points": [matches.point_flags for matches in contents.matches.values()],
         "calibration points": [] if rig is None else [rig.residuals.flags],
         "positions": [positions.flags for positions in contents.positions.values()],
     }
@@ -152,9 +160,19 @@ def _document_flags(contents: Contents) -> Iterator[str]:
             yield row[-1]
 
 
-def _job_sentence(job: str, points: ImagePoints | None, positions: Positions | None) -> str:
+def _job_sentence(
+    job: str,
+    points: ImagePoints | None,
+    positions: Positions | None,
+    matches: Correspondences | None,
+) -> str:
     """Count what one job found and measured."""
     parts = []
+    if matches is not None:
+        parts.append(
+            f"{int(matches.clean.sum())} of {counted(len(matches), 'point')} matched without a "
+            f"flag in {counted(len(matches.cameras), 'view')}"
+        )
     if points is not None:
         parts.append(
             f"{int(points.found.sum())} of {counted(len(points), 'image point')} found by "

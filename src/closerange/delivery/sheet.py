@@ -8,8 +8,10 @@ from typing import Any, TypeAlias
 
 from markupsafe import Markup
 
+from closerange.delivery.match_pictures import ScenePictures
 from closerange.delivery.overlays import Overlay
 from closerange.features.image_points import ImagePoints
+from closerange.matching.correspondences import Correspondences
 from closerange.position.positions import Positions
 from closerange.rig.rig import Rig
 from closerange.verification.error_map import ErrorMap
@@ -31,6 +33,10 @@ class Contents:
         Pictures with the points drawn on them.
     positions : mapping of str to Positions
         Measured positions by the name of their job.
+    matches : mapping of str to Correspondences
+        Matched points by the name of their job.
+    scenes : mapping of str to ScenePictures
+        Pictures of matched scenes by the name of their job.
     checks : tuple of mapping
         Documents of verification results, each with its ``kind``.
     error_map : ErrorMap or None
@@ -48,6 +54,8 @@ class Contents:
     points: Mapping[str, ImagePoints] = field(default_factory=dict)
     overlays: Sequence[Overlay] = ()
     positions: Mapping[str, Positions] = field(default_factory=dict)
+    matches: Mapping[str, Correspondences] = field(default_factory=dict)
+    scenes: Mapping[str, ScenePictures] = field(default_factory=dict)
     checks: tuple[Mapping[str, Any], ...] = ()
     error_map: ErrorMap | None = None
     provenance: Mapping[str, Any] = field(default_factory=dict)

@@ -8,7 +8,7 @@ without network and in any mail program. Text is 11 units high in drawings 640 u
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field
 
 from markupsafe import Markup, escape
@@ -27,6 +27,9 @@ BLUE, VERMILION, GREEN, PURPLE = "#0067a3", "#c44e00", "#00805e", "#a3467a"
 
 # light to dark with steadily falling luminance: it survives a black-and-white printer
 _HEAT = ((255, 244, 207), (252, 202, 120), (232, 130, 72), (176, 52, 74), (84, 18, 72))
+
+# steadily lighter, and lighter at its dark end than half of white is on a picture
+_DEPTH = ((92, 110, 255), (0, 164, 232), (0, 196, 140), (158, 218, 40), (255, 236, 120))
 
 Point = tuple[float, float]
 
@@ -50,12 +53,32 @@ def heat_colour(fraction: float) -> str:
     str
         ``#rrggbb``.
     """
+    return _on_scale(_HEAT, fraction)
+
+
+def depth_colour(fraction: float) -> str:
+    """Return the colour of a depth: from blue over green to light yellow.
+
+    Parameters
+    ----------
+    fraction : float
+        0 (dark blue) to 1 (light yellow); values outside are clipped, NaN is grey.
+
+    Returns
+    -------
+    str
+        ``#rrggbb``; all of them are lighter than a dimmed image, on which they are drawn.
+    """
+    return _on_scale(_DEPTH, fraction)
+
+
+def _on_scale(scale: Sequence[tuple[int, int, int]], fraction: float) -> str:
     if math.isnan(fraction):
         return "#e6e6e6"
-    position = min(max(fraction, 0.0), 1.0) * (len(_HEAT) - 1)
-    index = min(int(position), len(_HEAT) - 2)
+    position = min(max(fraction, 0.0), 1.0) * (len(scale) - 1)
+    index = min(int(position), len(scale) - 2)
     rest = position - index
-    pairs = zip(_HEAT[index], _HEAT[index + 1], strict=True)
+    pairs = zip(scale[index], scale[index + 1], strict=True)
     return "#" + "".join(f"{round(a + rest * (b - a)):02x}" for a, b in pairs)
 
 
@@ -242,7 +265,15 @@ def widened(values: Sequence[float], *, zero: bool = False, margin: float = 0.06
     return (0.0 if zero and low == 0 else low - air), (0.0 if zero and high == 0 else high + air)
 
 
-def heat_legend(drawing: Drawing, at: Point, width: float, limits: Point, label: str) -> None:
+def heat_legend(
+    drawing: Drawing,
+    at: Point,
+    width: float,
+    limits: Point,
+    label: str,
+    *,
+    colour: Callable[[float], str] = heat_colour,
+) -> None:
     """Draw the colour scale with its ticks and its unit.
 
     Parameters
@@ -257,6 +288,8 @@ def heat_legend(drawing: Drawing, at: Point, width: float, limits: Point, label:
         Values at its ends.
     label : str
         What the colour means, with unit.
+    colour : callable, optional
+        Colour of a fraction of the scale.
     """
     x, y = at
     steps = 40
@@ -267,7 +300,7 @@ def heat_legend(drawing: Drawing, at: Point, width: float, limits: Point, label:
             y=y,
             width=width / steps + 0.3,  # overlap: no hairlines between the pieces
             height=10,
-            fill=heat_colour((index + 0.5) / steps),
+            fill=colour((index + 0.5) / steps),
         )
     drawing.add("rect", x=x, y=y, width=width, height=10, fill="none", stroke=SOFT)
     scale = Scale(*limits, x, x + width)

@@ -16,9 +16,9 @@ from numpy.typing import NDArray
 
 from closerange.errors import DetectionError
 from closerange.features.corner_fit import CornerFits, fit_corners
-from closerange.features.grid_checking import mapped, plane_homography
-from closerange.features.grid_orientation import ROLL_LIMIT_RAD, roll_rad
+from closerange.features.grid_orientation import ROLL_LIMIT_RAD
 from closerange.features.pattern import Charuco, Chessboard
+from closerange.features.plane_map import mapped, plane_homography, plane_roll
 from closerange.flags import Flag
 from closerange.geometry.arrays import FloatArray, IntArray
 from closerange.images.frame import Frame
@@ -176,7 +176,7 @@ def canonical_order(xy: FloatArray, image: NDArray[Any], board: Chessboard) -> F
     Raises
     ------
     DetectionError
-        If the board looks the same after a turn and its roll is beyond 40 degrees.
+        If the board looks the same after a turn and its roll is not clearly below 45 degrees.
     """
     across, down = xy[:, -1] - xy[:, 0], xy[-1] - xy[0]
     a, b = across.mean(axis=0), down.mean(axis=0)
@@ -186,13 +186,14 @@ def canonical_order(xy: FloatArray, image: NDArray[Any], board: Chessboard) -> F
         return xy if _first_is_dark(xy, image) else xy[::-1, ::-1]
     turns = range(4) if board.rows == board.columns else (0, 2)
     turned = [np.rot90(xy, turn) for turn in turns]
-    rolls = [_roll(corners) for corners in turned]
-    best = int(np.argmin(np.abs(rolls)))
-    if abs(rolls[best]) > ROLL_LIMIT_RAD:
+    rolls = [plane_roll(_places(*c.shape[:2]), c.reshape(-1, 2)) for c in turned]
+    best = int(np.argmin([abs(roll) for roll, _ in rolls]))
+    roll, margin = rolls[best]
+    if abs(roll) + margin > ROLL_LIMIT_RAD:
         raise DetectionError(
             f"the board of {board.rows} x {board.columns} inner corners looks the same after a "
-            f"turn, and it is rolled by {np.degrees(abs(rolls[best])):.0f} degrees; the limit "
-            f"is {np.degrees(ROLL_LIMIT_RAD):.0f}",
+            f"turn, and it is rolled by {np.degrees(abs(roll)):.1f} degrees; the limit "
+            f"is {np.degrees(ROLL_LIMIT_RAD - margin):.1f}",
             remedy="hold it upright (exchange rows and columns if it is), or use a board with "
             "one odd and one even number of inner corners",
         )
@@ -281,12 +282,6 @@ def _saddle(
         grey = image[np.clip(y, 0, height - 1), np.clip(x, 0, width - 1)].astype(np.float64)
         total += np.where(seen, sign * grey, np.nan) / 4
     return np.nan_to_num(total)  # outside of the image nothing goes on
-
-
-def _roll(xy: FloatArray) -> float:
-    rows, columns = xy.shape[:2]
-    design = np.column_stack([_places(rows, columns), np.ones(rows * columns)])
-    return roll_rad(np.linalg.lstsq(design, xy.reshape(-1, 2), rcond=None)[0][:2].T)
 
 
 def _measured(frame: Frame, xy: FloatArray, places: FloatArray, share: float) -> Corners:

@@ -33,13 +33,13 @@ GAP_RAD = np.deg2rad(10.0)
 """Gap between the directions in which edge points lie, seen from the corner, that parts two arms:
 an arm without gaps of its own spans less from one point to the next."""
 
-SHARPEST_RAD = np.deg2rad(20.0)
-"""Least angle between two arms of a corner: the intersection of lines that meet at less is three
-times as uncertain as they are."""
+SHARPEST_RAD = np.deg2rad(55.0)
+"""Least angle between two arms of a corner: between arms that meet at less, the blur of each moves
+the other, and the corner outwards (by 0.3 px at 55 degrees, by 0.7 at 45)."""
 
-TURN_RAD = np.deg2rad(40.0)
+TURN_RAD = np.deg2rad(50.0)
 """Least angle by which an edge turns at a corner. Where it turns by less, it may be a circle of
-18 px radius or more; the arms of a smaller one are not straight."""
+14 px radius or more; the arms of a smaller one are not straight."""
 
 MOVED_PX = 4.0
 """A corner farther than this from where the image turns most belongs to other edges: that place
@@ -247,8 +247,7 @@ def _arm(edges: EdgePoints, point: IntArray, place: FloatArray) -> _Arm | None:
         return None
     lever = float((place - middle) @ axes[0]) ** 2 / spread
     variance = max(noise, scatter) * (1 / len(point) + lever) + model
-    outward = middle - place
-    outward = outward / np.linalg.norm(outward)
+    outward = axes[0] * np.sign((middle - place) @ axes[0])
     return _Arm(point, axes[1], middle, outward, float(np.sqrt(variance)))
 
 

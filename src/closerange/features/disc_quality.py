@@ -33,7 +33,7 @@ class Misfit:
     @property
     def beyond_noise(self) -> float:
         """What noise does not explain, as a share of the contrast."""
-        return self.by_contrast * float(np.sqrt(max(1 - self.by_noise**-2, 0.0)))
+        return self.by_contrast * float(np.sqrt(1 - max(self.by_noise, 1.0) ** -2))
 
 
 def noise_and_misfit(fit: LeastSquaresFit, band: Band) -> tuple[float, Misfit]:

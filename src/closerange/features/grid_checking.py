@@ -14,6 +14,7 @@ import numpy as np
 from closerange.features.grid_growing import Candidates, Node, Nodes, expected_radius
 from closerange.features.grid_orientation import refusal
 from closerange.features.pattern import DiscGrid
+from closerange.features.plane_map import mapped, plane_homography
 from closerange.geometry.arrays import FloatArray
 
 PLACE_TOLERANCE = 0.25
@@ -90,82 +91,6 @@ def size_ratios(nodes: Nodes, candidates: Candidates, grid: DiscGrid) -> FloatAr
         if local is not None:
             ratios[row] = _size_ratio(index, local[1], candidates, grid)
     return ratios
-
-
-def plane_homography(places: FloatArray, xy_px: FloatArray) -> FloatArray | None:
-    """Fit the homography from lattice places to image points by the normalised DLT.
-
-    Parameters
-    ----------
-    places : ndarray, shape (n, 2)
-        Places in the lattice, n >= 4.
-    xy_px : ndarray, shape (n, 2)
-        Image points, px.
-
-    Returns
-    -------
-    ndarray, shape (3, 3), or None
-        None where the places do not fix it (all but one on a line).
-
-    Notes
-    -----
-    Hartley & Zisserman, Multiple View Geometry, 2nd ed., algorithm 4.2.
-    """
-    scaled, t_places = _normalised(places)
-    points, t_points = _normalised(xy_px)
-    if scaled is None or points is None:
-        return None
-    x, y = points.T
-    ones = np.column_stack([scaled, np.ones(len(scaled))])
-    zeros = np.zeros_like(ones)
-    design = np.vstack(
-        [
-            np.hstack([ones, zeros, -x[:, None] * ones]),
-            np.hstack([zeros, ones, -y[:, None] * ones]),
-        ]
-    )
-    # of the 9 x 9 normal matrix; a full 2n x 2n basis would be wasted
-    values, vectors = np.linalg.eigh(design.T @ design)
-    if values[1] < 1e-6 * values[-1]:  # 1e-3 in singular values: two solutions fit alike
-        return None
-    homography: FloatArray = np.linalg.inv(t_points) @ vectors[:, 0].reshape(3, 3) @ t_places
-    return homography
-
-
-def mapped(homography: FloatArray, place: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Carry one place into the image.
-
-    Parameters
-    ----------
-    homography : ndarray, shape (3, 3)
-        From lattice to image.
-    place : ndarray, shape (2,)
-        The place.
-
-    Returns
-    -------
-    ndarray, shape (2,)
-        Image point, px.
-    ndarray, shape (2, 2)
-        Steps: how it moves, px, for one place along columns (row 0) and along rows (row 1).
-    """
-    x = homography @ np.array([place[0], place[1], 1.0])
-    point = x[:2] / x[2]
-    jacobian = (homography[:2, :2] - np.outer(point, homography[2, :2])) / x[2]
-    return point, jacobian.T
-
-
-def _normalised(points: FloatArray) -> tuple[FloatArray | None, FloatArray]:
-    """Move to the centroid and scale to a mean distance of sqrt(2)."""
-    centre = points.mean(axis=0)
-    spread = float(np.linalg.norm(points - centre, axis=1).mean())
-    if not spread > 0:
-        return None, np.eye(3)
-    scale = np.sqrt(2) / spread
-    transform = np.array(
-        [[scale, 0, -scale * centre[0]], [0, scale, -scale * centre[1]], [0, 0, 1]]
-    )
-    return (points - centre) * scale, transform
 
 
 def _local_map(

@@ -15,12 +15,12 @@ import numpy as np
 from closerange.errors import DetectionError
 from closerange.features.grid_growing import Candidates, Nodes
 from closerange.features.pattern import DiscGrid
+from closerange.features.plane_map import plane_roll
 from closerange.geometry.arrays import FloatArray, IntArray
 
-ROLL_LIMIT_RAD = float(np.radians(40))
-"""Upright targets are read up to this roll. At 45 degrees a square grid looks the same turned
-either way; the 5 degrees between are what perspective and a wide lens turn the middle of a
-tilted plate against its rim."""
+ROLL_LIMIT_RAD = float(np.radians(45))
+"""Upright targets are read up to this roll, less the uncertainty of the roll itself: at 45 degrees
+a square grid looks the same turned either way."""
 
 LINE_ROLL_LIMIT_RAD = float(np.radians(60))
 """The same for a single row or column, which no quarter turn can be confused with. Two cameras
@@ -76,24 +76,6 @@ def refusal(found: int, grid: DiscGrid, why: str, remedy: str) -> DetectionError
         f"({grid.rows} rows x {grid.columns} columns): {why}",
         remedy=remedy,
     )
-
-
-def roll_rad(px_from_mm: FloatArray) -> float:
-    """Return the roll of a plate: the rotation nearest to its affine image.
-
-    Parameters
-    ----------
-    px_from_mm : ndarray, shape (2, 2)
-        Columns: image of one mm along the columns and along the rows (downwards).
-
-    Returns
-    -------
-    float
-        Angle in rad from image x towards image y. Turning the camera about its axis changes
-        it by exactly that angle; tilting the plate away about any axis does not change it.
-    """
-    (a, b), (c, d) = px_from_mm
-    return float(np.arctan2(c - b, a + d))
 
 
 def place_lattice(
@@ -207,14 +189,16 @@ def _upright(
     layouts: dict[int, list[Layout]], ij: IntArray, xy_px: FloatArray, found: int, grid: DiscGrid
 ) -> Layout:
     """Take the turn of least roll; refuse near the limit and where the shape contradicts."""
-    rolls = {turn: _roll(_turned(ij, turn), xy_px, grid) for turn in layouts}
-    turn = min(rolls, key=lambda key: abs(rolls[key]))
-    if abs(rolls[turn]) > ROLL_LIMIT_RAD:
+    pitch = np.array(grid.pitch_mm)
+    rolls = {turn: plane_roll(_turned(ij, turn) * pitch, xy_px) for turn in layouts}
+    turn = min(rolls, key=lambda key: abs(rolls[key][0]))
+    roll, margin = rolls[turn]
+    if abs(roll) + margin > ROLL_LIMIT_RAD:
         raise refusal(
             found,
             grid,
-            f"rolled by {np.degrees(abs(rolls[turn])):.0f} degrees; an upright target is read "
-            f"up to {np.degrees(ROLL_LIMIT_RAD):.0f}",
+            f"rolled by {np.degrees(abs(roll)):.1f} degrees; an upright target is read up to "
+            f"{np.degrees(ROLL_LIMIT_RAD - margin):.1f}",
             'turn target or camera, or use a target with mark discs (orientation = "marks")',
         )
     best, second = sorted(layouts[turn], key=lambda layout: layout.cost)[:2]
@@ -282,13 +266,6 @@ def _turned(ij: IntArray, turn: int) -> IntArray:
     for _ in range(turn):
         ij = np.column_stack([ij[:, 1], -ij[:, 0]])
     return ij
-
-
-def _roll(ij: IntArray, xy_px: FloatArray, grid: DiscGrid) -> float:
-    """Return the roll of the best affine map from plate to image."""
-    plate = np.column_stack([ij * np.array(grid.pitch_mm), np.ones(len(ij))])
-    solution = np.linalg.lstsq(plate, xy_px, rcond=None)[0]
-    return roll_rad(solution[:2].T)
 
 
 def _class_numbers(grid: DiscGrid) -> IntArray:

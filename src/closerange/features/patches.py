@@ -89,7 +89,7 @@ def find_patches(pixels: NDArray[Any], edges: EdgePoints | None = None) -> Patch
     tree = cKDTree(edges.xy_px) if len(edges) else None
     found = []
     for region in _parted(grey, _regions(grey > threshold_report(grey).threshold)):
-        border = max(follow_borders(region), key=len).astype(np.float64)
+        border: FloatArray = max(follow_borders(region), key=len).astype(np.float64)
         if tree is not None:
             border = _on_edges(border, edges, tree)
         area, centroid = area_centroid(border)

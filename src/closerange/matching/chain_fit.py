@@ -140,6 +140,8 @@ def _spread(weight: FloatArray, chain: IntArray, known: BoolArray) -> FloatArray
     variance ``B^(1/2) w^(-3/4) / (2 sqrt 2)`` (B = `BEND_PX`); w is taken as the local mean, and
     a point at an end of its chain, which is held from one side only, has four times the variance.
     """
+    if not len(weight):
+        return weight
     reach = 10
     kernel = np.ones(2 * reach + 1)
     # not mode "same", which returns the longer of the two: chains may be shorter than the kernel

@@ -14,11 +14,12 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields, replace
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from closerange.errors import InputError
 from closerange.flags import Flag
 from closerange.geometry.arrays import BoolArray, FloatArray, IntArray, all_finite
-from closerange.matching.literal import BAND_PX, LiteralMatcher
+from closerange.matching.literal import BAND_PX, LiteralMatcher, Search
 from closerange.matching.literal_band import Bands
 from closerange.matching.literal_element import footprint, strip_footprint
 from closerange.matching.literal_matches import LiteralMatches, join_matches
@@ -134,8 +135,11 @@ def match_with_best_element(
     Raises
     ------
     InputError
-        As `closerange.matching.literal.LiteralMatcher` and its elements do.
+        If there is no element, and as `closerange.matching.literal.LiteralMatcher` and its
+        elements do.
     """
+    if not elements:
+        raise InputError("no element to choose from", remedy="name at least one shape and size")
     there = LiteralMatcher(cameras, masks, volume_mm, band_px=band_px)
     back = LiteralMatcher(cameras[::-1], masks[::-1], volume_mm, band_px=band_px)
     points = np.reshape(np.asarray(xy_px, np.float64), (-1, 2))
@@ -143,15 +147,14 @@ def match_with_best_element(
     smallest = int(np.argmin([size for _, size in elements]))
     parts = []
     for first in range(0, max(len(points), 1), _PIECE):
-        piece = points[first : first + _PIECE]
-        places = there.bands(piece)
+        search = there.search(points[first : first + _PIECE])
         trials = []
         for done, kind in enumerate(elements, start=1):
-            scan = _matched(there, masks[0], piece, places, kind)
-            trials.append(_Trial(*scan, _returning((back, masks[1]), piece, scan[0], kind)))
+            scan = _matched(there, masks[0], search, kind)
+            trials.append(_Trial(*scan, _returning((back, masks[1]), scan[0], kind)))
             if progress is not None:
                 progress(done, len(elements))
-        parts.append(_chosen(trials, smallest, _on_edge(masks[0], piece)))
+        parts.append(_chosen(trials, smallest, _on_edge(masks[0], search.pixel)))
     return _joined(parts)
 
 
@@ -230,19 +233,17 @@ _Scan = tuple[LiteralMatches, Hits, IntArray, FloatArray]
 
 def _returning(
     back: tuple[LiteralMatcher, BoolArray],
-    points: FloatArray,
     matches: LiteralMatches,
     kind: tuple[str, int],
 ) -> BoolArray:
     """Tell which matches, matched back, return to their points."""
     found = all_finite(matches.xy_px, 1)
-    returns = np.zeros(len(points), np.bool_)
+    returns = np.zeros(len(matches), np.bool_)
     if found.any():
         matcher, mask = back
-        seeds = matches.xy_px[found]
-        home = _matched(matcher, mask, seeds, matcher.bands(seeds), kind)[0]
+        home = _matched(matcher, mask, matcher.search(matches.xy_px[found]), kind)[0]
         with np.errstate(invalid="ignore"):
-            away = np.hypot(*(home.xy_px - points[found]).T)
+            away = np.hypot(*(home.xy_px - matches.seed_px[found]).T)
             returns[found] = away < RETURN_PX
     return returns
 
@@ -250,21 +251,20 @@ def _returning(
 def _matched(
     matcher: LiteralMatcher,
     mask: BoolArray,
-    points: FloatArray,
-    places: Bands,
+    search: Search,
     kind: tuple[str, int],
 ) -> _Scan:
     """Match points with one kind of element."""
     shape, size = kind
     if shape != "strip":
-        return _scanned(matcher, points, places, footprint(size, shape))
-    direction = edge_directions(mask, _pixel(mask, points))
+        return _scanned(matcher, search, footprint(size, shape))
+    direction = edge_directions(mask, search.pixel)
     groups = [np.flatnonzero(direction == turn) for turn in range(_DIRECTIONS)]
     found = []
     for turn, rows in enumerate(groups):
         angle = np.pi * turn / _DIRECTIONS
         strip = strip_footprint(size, (float(np.cos(angle)), float(np.sin(angle))))
-        found.append(_scanned(matcher, points[rows], _rows(places, rows), strip))
+        found.append(_scanned(matcher, search.select(rows), strip))
     order = np.argsort(np.concatenate(groups), kind="stable")
     matches, hits, place, distinct = zip(*found, strict=True)
     return (
@@ -275,33 +275,21 @@ def _matched(
     )
 
 
-def _scanned(
-    matcher: LiteralMatcher, points: FloatArray, places: Bands, inside: BoolArray
-) -> _Scan:
-    elements = matcher.elements(points, inside)
-    hits = matcher.scan(elements, places)
-    chosen = choose_places(hits, places)
-    matches = matcher.decided(points, len(inside), (elements, places), chosen)
-    return matches, hits, chosen.place, distinctness(hits, places, chosen, elements.pixels)
+def _scanned(matcher: LiteralMatcher, search: Search, inside: BoolArray) -> _Scan:
+    elements = matcher.elements(search, inside)
+    hits = matcher.scan(elements, search.places)
+    chosen = choose_places(hits, search.places)
+    matches = matcher.decided(search, elements, len(inside), chosen)
+    distinct = distinctness(hits, search.places, chosen, elements.pixels)
+    return matches, hits, chosen.place, distinct
 
 
-def _pixel(mask: BoolArray, points: FloatArray) -> IntArray:
-    """Return the nearest pixel of the image; any one for a point that is none."""
-    height, width = mask.shape
-    inside = np.clip(np.rint(np.nan_to_num(points)), 0, (width - 1, height - 1))
-    return np.asarray(inside, np.int64)
-
-
-def _on_edge(mask: BoolArray, points: FloatArray) -> BoolArray:
-    """Tell which points have an edge pixel at or beside them."""
-    column, row = _pixel(mask, points).T
+def _on_edge(mask: BoolArray, pixel: IntArray) -> BoolArray:
+    """Tell which pixels are, or touch, an edge pixel."""
+    column, row = pixel.T
     padded = np.pad(np.asarray(mask, np.bool_), 1)
     near = [padded[row + down, column + across] for down in (0, 1, 2) for across in (0, 1, 2)]
     return np.asarray(np.any(near, axis=0))
-
-
-def _rows(places: Bands, rows: NDArray[np.intp]) -> Bands:
-    return Bands(*(getattr(places, field.name)[rows] for field in fields(Bands)))
 
 
 def _fits(trials: Sequence[_Trial], smallest: int) -> tuple[FloatArray, FloatArray]:

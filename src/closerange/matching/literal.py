@@ -9,6 +9,7 @@ reference for comparison: `closerange.matching` has better matchers.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass, fields
 from typing import Any
 
 import numpy as np
@@ -18,18 +19,18 @@ from closerange.errors import InputError
 from closerange.features.edge_operators import edge_mask
 from closerange.features.threshold import threshold_report
 from closerange.flags import Flag
-from closerange.geometry.arrays import BoolArray, FloatArray, all_finite
+from closerange.geometry.arrays import BoolArray, FloatArray, IntArray, all_finite
 from closerange.matching.literal_band import Bands, bands
 from closerange.matching.literal_element import (
     EdgePixels,
     MappedElements,
-    check_size,
+    check_side,
     farthest_plane,
     footprint,
 )
 from closerange.matching.literal_matches import LiteralMatches, join_matches
 from closerange.matching.literal_scan import Chosen, Hits, PackedImage, choose_places
-from closerange.matching.search import checked_volume, inside_image
+from closerange.matching.sight import checked_volume, inside_image, sight_line
 from closerange.rig.camera import Camera
 
 Progress = Callable[[int, int], None]
@@ -71,6 +72,33 @@ def binary_images(
         masks = (edge_mask(grey)[0] for grey in (first, second))
     one, two = masks
     return one, two
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Search:
+    """Points and where they are looked for, whatever the element; M points.
+
+    Attributes
+    ----------
+    seed_px : ndarray, shape (M, 2)
+        Points of view 1; NaN for one that is none.
+    pixel : ndarray of int, shape (M, 2)
+        The nearest pixel, around which elements are cut.
+    centre_px : ndarray, shape (M, 2)
+        Where the plane of the elements puts each point in view 2; NaN where nowhere.
+    places : Bands
+        Neighbourhoods.
+    """
+
+    seed_px: FloatArray
+    pixel: IntArray
+    centre_px: FloatArray
+    places: Bands
+
+    def select(self, rows: NDArray[np.intp]) -> Search:
+        """Keep some points, in the given order."""
+        places = Bands(*(getattr(self.places, field.name)[rows] for field in fields(Bands)))
+        return Search(self.seed_px[rows], self.pixel[rows], self.centre_px[rows], places)
 
 
 class LiteralMatcher:
@@ -150,22 +178,52 @@ class LiteralMatcher:
         found = []
         for first in range(0, len(seeds), step):
             piece = seeds[first : first + step]
-            found.append(self._piece(piece, inside, whole_image=whole_image))
+            search = self.search(piece, whole_image=whole_image)
+            elements = self.elements(search, inside)
+            if whole_image:
+                hits = self._image.scan_all(elements, 0).reshape(1, -1)
+            else:
+                hits = self.scan(elements, search.places)
+            chosen = choose_places(hits, search.places)
+            found.append(self.decided(search, elements, len(inside), chosen))
             if progress is not None:
                 progress(first + len(piece), len(seeds))
         return join_matches(found)
 
-    def bands(self, xy_px: FloatArray) -> Bands:
-        """Return the neighbourhoods of points, shape (M, 2)."""
-        return bands(self.cameras, xy_px, self.volume_mm, self.band_px)
-
-    def elements(self, xy_px: FloatArray, inside: BoolArray) -> MappedElements:
-        """Cut the elements around points, shape (M, 2), and carry them into view 2.
+    def search(self, seeds: FloatArray, *, whole_image: bool = False) -> Search:
+        """Find the neighbourhoods of points.
 
         Parameters
         ----------
-        xy_px : ndarray, shape (M, 2)
-            Points; an element is empty where there is none in the image.
+        seeds : ndarray, shape (M, 2)
+            Points; NaN for one that is none.
+        whole_image : bool, optional
+            The whole image 2 instead of the band around the segment.
+
+        Returns
+        -------
+        Search
+            For elements of any kind.
+        """
+        first, second = self.cameras
+        rays = sight_line(first, seeds, self.volume_mm)
+        there = inside_image(first, seeds)
+        last = np.array(first.size_px) - 1
+        pixel = np.clip(np.rint(np.where(there[:, None], seeds, 0.0)), 0, last)
+        return Search(
+            seed_px=seeds,
+            pixel=pixel.astype(np.int64),
+            centre_px=self._edges.carried(np.where(there[:, None], rays.direction, np.nan)),
+            places=_everywhere(second, there) if whole_image else bands(second, rays, self.band_px),
+        )
+
+    def elements(self, search: Search, inside: BoolArray) -> MappedElements:
+        """Cut the elements around points and carry them into view 2.
+
+        Parameters
+        ----------
+        search : Search
+            Of M points; an element is empty where there is no point in the image.
         inside : ndarray of bool, shape (S, S)
             Footprint.
 
@@ -179,35 +237,26 @@ class LiteralMatcher:
         InputError
             If the element is larger than image 1.
         """
-        first = self.cameras[0]
-        _check_footprint(first, inside)
-        usable = inside_image(first, xy_px)
-        seeds = np.where(usable[:, None], xy_px, np.nan)
-        pixel = np.rint(np.where(usable[:, None], xy_px, 0.0)).astype(np.int64)
-        pixel = np.clip(pixel, 0, np.array(first.size_px) - 1)
-        return self._edges.elements(pixel, self._edges.carried(seeds), inside)
+        _check_footprint(self.cameras[0], inside)
+        return self._edges.elements(search.pixel, search.centre_px, inside)
 
     def scan(self, elements: MappedElements, places: Bands) -> Hits:
         """Count the pixels of elements that are present at each place; see `PackedImage.scan`."""
         return self._image.scan(elements, places)
 
     def decided(
-        self,
-        seeds: FloatArray,
-        size_px: int,
-        searched: tuple[MappedElements, Bands],
-        chosen: Chosen,
+        self, search: Search, elements: MappedElements, side_px: int, chosen: Chosen
     ) -> LiteralMatches:
         """Turn chosen places into matches with their flags.
 
         Parameters
         ----------
-        seeds : ndarray, shape (M, 2)
-            Points.
-        size_px : int
-            N of the elements.
-        searched : tuple of MappedElements and Bands
-            Elements and neighbourhoods, from `elements` and `bands`.
+        search : Search
+            Of M points.
+        elements : MappedElements
+            Of `elements`.
+        side_px : int
+            Their N.
         chosen : Chosen
             Of `choose_places` after `scan`.
 
@@ -216,7 +265,7 @@ class LiteralMatcher:
         LiteralMatches
             M points.
         """
-        elements, places = searched
+        seeds, places = search.seed_px, search.places
         flags = places.flags.copy()
         there = inside_image(self.cameras[0], seeds)
         known = all_finite(seeds, 1)
@@ -228,7 +277,7 @@ class LiteralMatcher:
         rows = np.arange(len(seeds))
         at = np.column_stack([places.column[rows, chosen.place], places.row[rows, chosen.place]])
         flags[found & chosen.spread] |= int(Flag.ambiguous)
-        cut = _cut(self.cameras[0], np.rint(seeds), size_px // 2) | _sticks_out(
+        cut = _cut(self.cameras[0], np.rint(seeds), side_px // 2) | _sticks_out(
             self.cameras[1], at, elements
         )
         flags[found & cut] |= int(Flag.at_border)
@@ -240,19 +289,6 @@ class LiteralMatcher:
             ties=np.where(found, chosen.ties, 0),
             flags=flags,
         )
-
-    def _piece(self, seeds: FloatArray, inside: BoolArray, *, whole_image: bool) -> LiteralMatches:
-        elements = self.elements(seeds, inside)
-        if whole_image:
-            places = _everywhere(self.cameras[1], inside_image(self.cameras[0], seeds))
-            hits = np.stack(
-                [self._image.scan_all(elements, row).ravel() for row in range(len(seeds))]
-            )
-        else:
-            places = self.bands(seeds)
-            hits = self.scan(elements, places)
-        chosen = choose_places(hits, places)
-        return self.decided(seeds, len(inside), (elements, places), chosen)
 
 
 def _check_size(camera: Camera, mask: BoolArray) -> None:
@@ -271,7 +307,7 @@ def _check_footprint(camera: Camera, inside: BoolArray) -> None:
             f"an element of shape {inside.shape} with {np.count_nonzero(inside)} px",
             remedy="give a square array with some pixels set",
         )
-    check_size(len(inside))
+    check_side(len(inside))
     if len(inside) > min(camera.size_px):
         raise InputError(
             f"an element of {len(inside)} px in an image of {min(camera.size_px)} px",
@@ -306,13 +342,13 @@ def _sticks_out(camera: Camera, at: NDArray[np.int32], elements: MappedElements)
     return np.asarray(((lowest < 0) | (highest > last)).any(axis=1))
 
 
-def match_literally(
+def match_literal(
     images: Sequence[NDArray[Any]],
     cameras: Sequence[Camera],
     xy_px: ArrayLike,
     volume_mm: ArrayLike,
     *,
-    size_px: int = 15,
+    side_px: int = 15,
     band_px: float = BAND_PX,
     original: bool = False,
     whole_image: bool = False,
@@ -329,7 +365,7 @@ def match_literally(
         Points of view 1.
     volume_mm : array_like, shape (2, 3)
         Where they may be; `closerange.matching.search.between_planes` gives the thesis' volume.
-    size_px : int, optional
+    side_px : int, optional
         N, odd: 15 for edge points, 59 for centroids in the thesis' images of 512 px, 150 mm.
     band_px : float, optional
         Half-width of the neighbourhood around the epipolar segment, 0.5 or more.
@@ -349,7 +385,7 @@ def match_literally(
         If an image has another size than its camera, or the element, the band or the volume is
         none.
     """
-    inside = footprint(size_px)
+    inside = footprint(side_px)
     for camera, image in zip(cameras, images, strict=True):
         _check_size(camera, image)
     masks = binary_images(images, original=original)

@@ -10,7 +10,8 @@ from numpy.typing import NDArray
 from closerange.errors import InputError
 from closerange.flags import Flag
 from closerange.geometry.arrays import BoolArray, FloatArray, IntArray
-from closerange.matching.search import EpipolarSegments, epipolar_segment
+from closerange.matching.segment_clipping import SecondView
+from closerange.matching.sight import SightLines
 from closerange.rig.camera import Camera
 
 WIDEST_PX = 1000.0
@@ -36,7 +37,7 @@ class Bands:
     valid : ndarray of bool, shape (M, L)
         Which of them belong to the neighbourhood.
     flags : ndarray of int, shape (M,)
-        Why there are none: those of `EpipolarSegments`.
+        Why there are none: those of `closerange.matching.search.EpipolarSegments`.
     """
 
     column: NDArray[np.int32]
@@ -45,19 +46,15 @@ class Bands:
     flags: IntArray
 
 
-def bands(
-    cameras: tuple[Camera, Camera], xy_px: FloatArray, volume_mm: FloatArray, band_px: float
-) -> Bands:
+def bands(camera_2: Camera, rays: SightLines, band_px: float) -> Bands:
     """List the pixels around epipolar segments.
 
     Parameters
     ----------
-    cameras : tuple of Camera
-        View 1 and view 2.
-    xy_px : ndarray, shape (M, 2)
-        Observed px in view 1.
-    volume_mm : ndarray, shape (2, 3)
-        See `epipolar_segment`.
+    camera_2 : Camera
+        View 2.
+    rays : SightLines
+        Of M points of view 1, cut at the volume.
     band_px : float
         Half-width b. The segment is y = f(x) if it runs more along x than along y; the pixels of
         a column x are those with f(x) - b <= y < f(x) + b, and likewise with x and y exchanged.
@@ -79,15 +76,14 @@ def bands(
             f"a band of half-width {band_px} px",
             remedy=f"give 0.5 to {WIDEST_PX:.0f} px: below, it would have gaps",
         )
-    segments = epipolar_segment(*cameras, xy_px, volume_mm, step_px=_STEP_PX)
-    lines = _lines(segments)
+    lines = _lines(*_curves(camera_2, rays))
     per_column = int(np.ceil(2 * band_px))
-    shape = (len(segments), max(int(lines.columns.max(initial=0)), 1) * per_column)
+    shape = (len(rays), max(int(lines.columns.max(initial=0)), 1) * per_column)
     column, row = np.empty(shape, np.int32), np.empty(shape, np.int32)
     valid = np.empty(shape, np.bool_)
     step = max(_CHUNK // shape[1], 1)
-    width, height = cameras[1].size_px
-    for first in range(0, len(segments), step):
+    width, height = camera_2.size_px
+    for first in range(0, len(rays), step):
         part = slice(first, first + step)
         along, across, exists = _pixels(lines, part, band_px, per_column)
         upright = lines.upright[part, None]
@@ -114,12 +110,31 @@ class _Lines:
     flags: IntArray
 
 
-def _lines(segments: EpipolarSegments) -> _Lines:
+def _curves(camera_2: Camera, rays: SightLines) -> tuple[FloatArray, IntArray]:
+    """Return samples of the segments, shape (M, K, 2), 0 where there is none, and their flags.
+
+    What `closerange.matching.search.epipolar_segment` does, with few samples: it spaces them
+    by the lens, which takes as long as all the rest.
+    """
+    view = SecondView(camera_2)
+    segments = view.clip(rays)
+    length = np.nan_to_num(np.linalg.norm(segments.end - segments.start, axis=1))
+    steps = 1 if view.straight else int(np.ceil(float(length.max(initial=0.0)) / _STEP_PX))
+    fraction = np.linspace(0.0, 1.0, max(steps, 1) + 1)
+    fraction = np.where(np.isfinite(segments.near_mm)[:, None], fraction, np.nan)
+    kept, samples = view.clip_samples(segments, fraction)
+    seen = np.isfinite(kept)
+    # samples outside of the image repeat the last one inside, those before the first the first
+    place = np.where(seen, np.arange(seen.shape[1]), -1)
+    place = np.maximum(np.maximum.accumulate(place, axis=1), np.argmax(seen, axis=1)[:, None])
+    samples = np.nan_to_num(np.take_along_axis(samples, place[..., None], axis=1))
+    flags = rays.flags | segments.flags
+    nothing = ~seen.any(axis=1) & (flags & ~int(Flag.near_parallel) == 0)
+    return samples, np.where(nothing, flags | int(Flag.outside_image), flags)
+
+
+def _lines(samples: FloatArray, flags: IntArray) -> _Lines:
     """Choose the axis along which each segment runs."""
-    rows = np.arange(len(segments))
-    last = np.maximum(segments.count - 1, 0)
-    place = np.minimum(np.arange(segments.xy_px.shape[1]), last[:, None])
-    samples = np.nan_to_num(segments.xy_px[rows[:, None], place])
     ends = samples[:, -1] - samples[:, 0]
     upright = np.abs(ends[:, 1]) > np.abs(ends[:, 0])
     major = np.where(upright[:, None], samples[..., 1], samples[..., 0])
@@ -129,7 +144,7 @@ def _lines(segments: EpipolarSegments) -> _Lines:
     way = sign[:, None] * (major - start[:, None])
     # a curve that turns back is none that pixels can be listed along
     turns = (np.diff(way, axis=1) < 0).any(axis=1)
-    flags = np.where(turns, segments.flags | int(Flag.not_converged), segments.flags)
+    flags = np.where(turns, flags | int(Flag.not_converged), flags)
     columns = np.abs(np.rint(start + length) - np.rint(start)).astype(np.int64) + 1
     columns[flags & ~int(Flag.near_parallel) != 0] = 0
     return _Lines(upright, start, sign, columns, way, other, np.asarray(flags, np.int64))

@@ -22,12 +22,12 @@ _BITS = 2**19
 """Bytes of unpacked blocks that are held at once: the cache holds half a megabyte."""
 
 
-def footprint(size_px: int, shape: str = "square") -> BoolArray:
+def footprint(side_px: int, shape: str = "square") -> BoolArray:
     """Return which pixels around a candidate belong to its element.
 
     Parameters
     ----------
-    size_px : int
+    side_px : int
         N, odd, 3 or more.
     shape : {"square", "disc", "cross"}, optional
         All N x N pixels as in the thesis; those within (N - 1) / 2 of the centre; or the middle
@@ -43,26 +43,26 @@ def footprint(size_px: int, shape: str = "square") -> BoolArray:
     InputError
         If the size or the shape is none.
     """
-    check_size(size_px)
+    check_side(side_px)
     if shape not in SHAPES:
         raise InputError(
             f"an element of shape {shape!r}", remedy=f"choose one of {', '.join(SHAPES)}"
         )
     if shape == "disc":
-        return StructuringElement.disc(size_px // 2).mask()[0]
-    box = np.ones((size_px, size_px), np.bool_)
+        return StructuringElement.disc(side_px // 2).mask()[0]
+    box = np.ones((side_px, side_px), np.bool_)
     if shape == "cross":
-        across = np.abs(np.arange(size_px) - size_px // 2) <= max(size_px // 6, 1)
+        across = np.abs(np.arange(side_px) - side_px // 2) <= max(side_px // 6, 1)
         box &= across[:, None] | across
     return box
 
 
-def strip_footprint(size_px: int, tangent: tuple[float, float]) -> BoolArray:
+def strip_footprint(side_px: int, tangent: tuple[float, float]) -> BoolArray:
     """Return the pixels beside the straight line through a candidate along its edge.
 
     Parameters
     ----------
-    size_px : int
+    side_px : int
         Length N, odd, 3 or more.
     tangent : (float, float)
         Unit vector x, y along the edge.
@@ -78,19 +78,19 @@ def strip_footprint(size_px: int, tangent: tuple[float, float]) -> BoolArray:
     InputError
         If the size is none.
     """
-    check_size(size_px)
-    reach = np.arange(size_px) - size_px // 2
+    check_side(side_px)
+    reach = np.arange(side_px) - side_px // 2
     along = tangent[0] * reach + tangent[1] * reach[:, None]
     across = tangent[0] * reach[:, None] - tangent[1] * reach
-    inside = (np.abs(along) <= size_px // 2 + 1e-9) & (np.abs(across) <= max(size_px / 6, 1.0))
+    inside = (np.abs(along) <= side_px // 2 + 1e-9) & (np.abs(across) <= max(side_px / 6, 1.0))
     return np.asarray(inside)
 
 
-def check_size(size_px: int) -> None:
+def check_side(side_px: int) -> None:
     """Refuse elements without a centre pixel or without surroundings."""
-    if size_px != int(size_px) or size_px < 3 or size_px % 2 == 0:
+    if side_px != int(side_px) or side_px < 3 or side_px % 2 == 0:
         raise InputError(
-            f"an element of {size_px} x {size_px} px",
+            f"an element of {side_px} x {side_px} px",
             remedy="give an odd whole number from 3 on: the candidate is the pixel in the middle",
         )
 
@@ -175,17 +175,17 @@ class EdgePixels:
         self._cameras, self._plane = (camera_1, camera_2), plane
         self._number = np.full(mask.shape, -1, np.int32)
         row, column = np.nonzero(mask)
-        there = self.carried(np.column_stack([column, row]).astype(np.float64))
+        there = self.carried(camera_1.directions(np.column_stack([column, row])))
         # a pixel that cannot be carried is no part of any element
         known = all_finite(there, 1)
         self._across, self._down = np.ascontiguousarray(there[known].T)
         self._number[row[known], column[known]] = np.arange(len(self._down), dtype=np.int32)
 
-    def carried(self, xy_px: FloatArray) -> FloatArray:
-        """Return where pixels of view 1 lie in view 2 through the plane; NaN if nowhere."""
+    def carried(self, direction: FloatArray) -> FloatArray:
+        """Return where rays of camera 1, shape (M, 3), meet the plane, in view 2, or NaN."""
         axis, offset = self._plane
         first, second = self._cameras
-        direction, centre = first.directions(xy_px), first.centre_mm
+        centre = first.centre_mm
         with np.errstate(divide="ignore", invalid="ignore"):
             distance = (offset - centre[axis]) / direction[:, axis]
         distance = np.where(np.isfinite(distance) & (distance > 0), distance, np.nan)
@@ -245,14 +245,15 @@ class EdgePixels:
         row, column = np.nonzero(inside)
         window = (row * padded.shape[1] + column).astype(np.int32)
         corner = (pixel[:, 1] * padded.shape[1] + pixel[:, 0]).astype(np.int32)
-        flat = padded.ravel()
+        numbers = padded.ravel()
+        edge = numbers >= 0
         point, number = [np.zeros(0, np.intp)], [np.zeros(0, np.int32)]
         step = max(_COVERED // len(window), 1)
         for first in range(0, len(corner), step):
-            found = flat.take(corner[first : first + step, None] + window).ravel()
-            place = np.flatnonzero(found >= 0)
+            looked = (corner[first : first + step, None] + window).ravel()
+            place = np.flatnonzero(edge.take(looked))
             point.append(first + place // len(window))
-            number.append(found[place])
+            number.append(numbers.take(looked.take(place)))
         return np.concatenate(point), np.concatenate(number)
 
 

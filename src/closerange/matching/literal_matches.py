@@ -18,6 +18,11 @@ from closerange.geometry.arrays import (
 )
 from closerange.matching.correspondences import Correspondences
 
+VARIANCE_PX2 = 1.0 / 3.0
+"""Of a right match: bands of edge pixels, three wide, still cover each other a pixel to either
+side, and within that any whole pixel may win. Found on four rendered scenes: 0.5 to 0.7 px along
+the segment for 0.58; across it the rounding alone, 0.25 px. Wrong matches are another matter."""
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class LiteralMatches:
@@ -78,16 +83,20 @@ class LiteralMatches:
         Returns
         -------
         Correspondences
-            `mismatch` is the count; covariances are unknown: the method states none.
+            `mismatch` is the count. The method states no uncertainty; the covariance of a match
+            is that of its construction, `VARIANCE_PX2` in both directions.
         """
         first, second = cameras
         missing = ~all_finite(self.seed_px, 1)
         seed_flags = np.where(missing, int(Flag.not_found), 0)
+        cov = np.full((len(self), 2, 2, 2), np.nan)
+        cov[all_finite(self.xy_px, 1), 1] = VARIANCE_PX2 * np.eye(2)
         return Correspondences.of(
             cameras=(first, second),
             point=point,
             placement=placement,
             xy_px=np.stack([self.seed_px, self.xy_px], axis=1),
+            cov_px2=cov,
             mismatch=self.mismatch,
             flags=np.column_stack([seed_flags, self.flags]),
         )

@@ -94,7 +94,9 @@ def noise_map(grey: NDArray[np.float32]) -> NDArray[np.float32]:
     return noise_curve(grey, level).at(level).astype(np.float32)
 
 
-def chosen_sizes(information: FloatArray, half_widths: tuple[int, ...]) -> IntArray:
+def chosen_sizes(
+    information: FloatArray, half_widths: tuple[int, ...], enough_px: float = ENOUGH_PX
+) -> IntArray:
     """Choose the size of the structuring element of each point.
 
     The smallest that holds enough information along the epipolar curve: noise falls with the area
@@ -108,13 +110,15 @@ def chosen_sizes(information: FloatArray, half_widths: tuple[int, ...]) -> IntAr
         About the match along the epipolar curve, both images together.
     half_widths : tuple of int
         S half-widths, ascending.
+    enough_px : float, optional
+        Standard deviation that the information must allow.
 
     Returns
     -------
     ndarray of int, shape (N,)
         Number of the size; -1 where none holds enough texture.
     """
-    enough = information >= ENOUGH_PX**-2
+    enough = information >= enough_px**-2
     core = np.ones_like(enough)
     for number, half_width in enumerate(half_widths):
         inner = [k for k in range(number) if half_widths[k] <= half_width // 2]

@@ -18,6 +18,7 @@ from closerange.matching.search import checked_volume, epipolar_segment, inside_
 from closerange.matching.window_candidates import Places, find_places, pyramid, start_level
 from closerange.matching.window_edges import vote_planes
 from closerange.matching.window_information import (
+    ENOUGH_PX,
     HALF_WIDTHS,
     Information,
     chosen_sizes,
@@ -250,7 +251,8 @@ class _Job:
         some = rays.select(known)
         back = np.nan_to_num(some.back(middle[known]))
         information = Information.of(self.greys[0], some.xy_px, widths).along(back) / 2
-        chosen = chosen_sizes(information, widths)
+        enough = ENOUGH_PX if self.fixed is None else UNSURE_PX
+        chosen = chosen_sizes(information, widths, enough)
         sizes[known] = np.where(chosen >= 0, np.array(widths)[chosen], 0)
         return sizes
 

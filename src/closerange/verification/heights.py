@@ -71,7 +71,7 @@ class HeightCheck:
         Median, 95th percentile and largest of the absolute errors of all single points.
     elsewhere : int
         Usable points that belong to no top: other edges, the ground, gross mismatches.
-    left_out : int
+    flagged : int
         Points without a position, or with a flag that condemns them.
     missing : tuple of (str, str)
         (placement, part) without enough points.
@@ -99,7 +99,7 @@ class HeightCheck:
     points_p95_mm: float
     points_max_mm: float
     elsewhere: int
-    left_out: int
+    flagged: int
     missing: tuple[tuple[str, str], ...] = ()
     reservations: tuple[str, ...] = ()
 
@@ -210,7 +210,7 @@ def height_test(
         points_p95_mm=float(np.quantile(np.abs(single), 0.95)),
         points_max_mm=float(np.abs(single).max()),
         elsewhere=int((good & (belongs < 0)).sum()),
-        left_out=int((~good).sum()),
+        flagged=int((~good).sum()),
         missing=missing,
         reservations=reservations,
     )

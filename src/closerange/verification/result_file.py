@@ -14,17 +14,18 @@ from closerange.errors import SchemaError
 from closerange.files import MAX_TABLE_BYTES, dump_json, load_json
 
 SCHEMA = "closerange.result/1"
-KINDS = ("control", "single-point", "lengths")
+KINDS = ("control", "single-point", "lengths", "heights")
 
 _ROWS = {  # what every document of a kind has, so that a report never meets a gap
     "control": ("rows", "groups", "coverage", "systematic", "missing", "left_out"),
     "single-point": ("rows", "accuracy", "repeatability", "luck", "slopes", "decision"),
     "lengths": ("rows", "rms_mm", "max_mm", "missing"),
+    "heights": ("rows", "rms_mm", "max_mm", "points_median_mm", "tolerance_mm", "missing"),
 }
 
 
 class Result(Protocol):
-    """What can be stored: `ControlCheck`, `AcceptanceReport` or `LengthCheck`."""
+    """What can be stored: `ControlCheck`, `AcceptanceReport`, `LengthCheck`, `HeightCheck`."""
 
     def to_document(self) -> dict[str, Any]:
         """Return a JSON-ready document with its ``kind``."""
@@ -38,7 +39,7 @@ def write_result(
 
     Parameters
     ----------
-    result : ControlCheck, AcceptanceReport or LengthCheck
+    result : ControlCheck, AcceptanceReport, LengthCheck or HeightCheck
         What was found.
     path : Path or str
         JSON file, replaced whole or not at all.

@@ -96,7 +96,9 @@ def single_point_test(
     if not (known & good).any():
         raise DataError(
             f"none of {len(positions)} readings is usable and has one of {len(truth)} truths",
-            remedy="use the same names of placements and points in both tables",
+            remedy="the flags say why readings cannot be used: measure again"
+            if known.any()
+            else "use the same names of placements and points in both tables",
         )
     stated = positions.noise_cov_mm2 if noise_cov_mm2 is None else noise_cov_mm2
     groups = group_readings(positions, known & good, stated)

@@ -20,8 +20,8 @@ from closerange.geometry.arrays import BoolArray, FloatArray, IntArray
 from closerange.images import Frame, check_frame
 from closerange.matching.corner_matcher import match_corners
 from closerange.matching.correspondences import Correspondences
-from closerange.matching.literal import match_literally
-from closerange.matching.literal_element import check_size
+from closerange.matching.literal import match_literal
+from closerange.matching.literal_element import check_side
 from closerange.matching.matcher import View, match_views, views_of
 from closerange.matching.sight import inside_image
 from closerange.position.suspicion import DoubtWarning
@@ -228,7 +228,7 @@ def _check_options(
             remedy="leave it out, or choose the literal method",
         )
     if element_px is not None:
-        check_size(element_px)
+        check_side(element_px)
 
 
 def _first(frames: Mapping[str, Frame], name: str) -> dict[str, Frame]:
@@ -337,9 +337,9 @@ def _literal(
     first = views[0]
     xy, flags, mismatch = [seeds.xy_px], [seeds.flags], np.full(len(seeds), np.nan)
     for done, other in enumerate(views[1:], start=1):
-        found = match_literally(
+        found = match_literal(
             (first.pixels, other.pixels), (first.camera, other.camera), seeds.xy_px, volume_mm,
-            size_px=element_px,
+            side_px=element_px,
         )  # fmt: skip
         xy.append(found.xy_px)
         flags.append(found.flags)

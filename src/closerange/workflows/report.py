@@ -6,6 +6,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+from closerange.delivery.match_pictures import ScenePictures
 from closerange.delivery.overlays import Overlay
 from closerange.delivery.report import render_report
 from closerange.errors import SchemaError
@@ -24,6 +25,7 @@ _TITLES = {
     "control": "Comparison with control points",
     "single-point": "Single-point test",
     "lengths": "Length test",
+    "heights": "Heights of known parts",
 }
 
 
@@ -107,13 +109,18 @@ def report_of_run(document: Mapping[str, Any], *, folder: Path, source: str) -> 
     """
     try:
         rig = rig_from_document(document["rig"], source=source)
-        points, positions = read_tables(document["tables"], folder, source=source)
+        points, positions, matches = read_tables(document["tables"], folder, source=source)
         return render_report(
             title=document["title"],
             rig=rig,
             points=points,
             overlays=[Overlay.from_document(entry) for entry in document["overlays"]],
             positions=positions,
+            matches=matches,
+            scenes={
+                str(entry["job"]): ScenePictures.from_document(entry)
+                for entry in document.get("scenes", ())
+            },
             checks=document["results"],
             error_map=error_map_of(rig),
             provenance=document["provenance"],

@@ -10,43 +10,40 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from closerange.delivery.overlays import Overlay, make_overlay
+import numpy as np
+
+from closerange.delivery.overlays import Overlay
 from closerange.errors import CloseRangeWarning, FileError
 from closerange.features.image_points import ImagePoints
 from closerange.files import dump_json, sha256, write_text
+from closerange.flags import format_flags
 from closerange.images import (
     check_duplicates,
     check_exposures,
     group_images,
-    natural_key,
-    placement_and_reading,
     read_exposures,
     read_image,
 )
 from closerange.position.positions import Positions
 from closerange.rig.rig import Rig
 from closerange.rig.rig_file import rig_to_document, write_rig
-from closerange.settings import Detection, Job, Settings, images_of, inside, read_settings
+from closerange.settings import Detection, Job, MatchJob, Settings, images_of, inside, read_settings
+from closerange.verification.control_check import usable
 from closerange.verification.judgement import Limits
 from closerange.verification.result_file import write_result
 from closerange.workflows.calibrate import calibrate
-from closerange.workflows.detect import detect, read_crops
+from closerange.workflows.detect import detect
 from closerange.workflows.inputs import copy_inputs, versions
+from closerange.workflows.match_scene import MatchedScene, match_scene
 from closerange.workflows.measure import measure
 from closerange.workflows.report import RUN_SCHEMA, report
 from closerange.workflows.result_folder import check_free, put
+from closerange.workflows.run_overlays import JOB_OVERLAYS, MAX_OVERLAYS, overlays_of
 from closerange.workflows.run_tables import CALIBRATION, write_tables
 from closerange.workflows.verify import Result, verify
 
 Announce = Callable[[str, int, int], None]
 """Called with (what is being done, done, total)."""
-
-MAX_OVERLAYS = 20
-"""Pictures of the calibration in a report: of more images the first ones are shown."""
-
-JOB_OVERLAYS = 2
-"""Pictures of each camera and job: enough to see what was measured, and how well it was seen."""
-
 
 CYCLE_TIME_INCLUDES = (
     "the program's own time, mean of {} readings, from the images on disk to the position: reading "
@@ -67,10 +64,12 @@ class JobResult:
     positions : Positions
         Measured positions.
     result : ControlCheck, AcceptanceReport, LengthCheck or None
-        Comparison with the truth, if one was given.
+        Comparison with the truth, if one was given and any position can be used.
     cycle_time_s : float
         The program's own time for one reading of all cameras, from the images on disk to the
         position. Written into the results only where the project limits it.
+    scene : MatchedScene or None
+        Matches and pictures of a job that matches; its `points` are those of the matches.
     """
 
     name: str
@@ -78,6 +77,16 @@ class JobResult:
     positions: Positions
     result: Result | None
     cycle_time_s: float
+    scene: MatchedScene | None = None
+
+    @property
+    def failure(self) -> str:
+        """Why it cannot be relied upon, although its files are written; else empty."""
+        if self.positions.doubt:
+            return "its points contradict the rig, see the warning"
+        if not usable(self.positions).any():
+            return f"none of its {len(self.positions)} positions can be used"
+        return self.result.hollow if self.result is not None else ""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -184,11 +193,17 @@ def _measure_all(
     )
     elapsed = time.perf_counter() - start
     said("calibrating", 1, 1)
-    jobs = tuple(_run_job(settings, job, rig, said) for job in settings.job)
-    overlays = _overlays(settings, calibration, points, rig, most=MAX_OVERLAYS)
+    jobs = tuple(
+        _run_job(settings, job, rig, said)
+        if isinstance(job, Job)
+        else _run_match(settings, job, rig, said)
+        for job in settings.job
+    )
+    overlays = overlays_of(settings, calibration, points, rig, most=MAX_OVERLAYS)
     for job, done in zip(settings.job, jobs, strict=True):
-        most = JOB_OVERLAYS * len(job.images)
-        overlays += _overlays(settings, job, done.points, None, most=most)
+        if isinstance(job, Job):
+            most = JOB_OVERLAYS * len(job.images)
+            overlays += overlays_of(settings, job, done.points, None, most=most)
     return RunResult(folder, rig, points, jobs, (), elapsed), overlays
 
 
@@ -199,7 +214,7 @@ def _run_job(settings: Settings, job: Job, rig: Rig, said: Announce) -> JobResul
     readings = len(set(zip(points.placement, points.reading, strict=True)))
     cycle_s = (detection_s + time.perf_counter() - start) / readings
     result: Result | None = None
-    if job.verify is not None and job.truth is not None:
+    if job.verify is not None and job.truth is not None and _any_usable(job, positions):
         timed = job.limits is not None and job.limits.cycle_time_s is not None
         result = verify(
             job.verify,
@@ -211,6 +226,32 @@ def _run_job(settings: Settings, job: Job, rig: Rig, said: Announce) -> JobResul
             cycle_time_includes=CYCLE_TIME_INCLUDES.format(readings) if timed else "",
         )
     return JobResult(job.name, points, positions, result, cycle_s)
+
+
+def _run_match(settings: Settings, job: MatchJob, rig: Rig, said: Announce) -> JobResult:
+    what = f"matching: {job.name}"
+    said(what, 0, 1)
+    scene = match_scene(settings, job, rig, progress=lambda done, total: said(what, done, total))
+    positions = scene.positions
+    result: Result | None = None
+    if job.verify is not None and job.truth is not None and _any_usable(job, positions):
+        result = verify(job.verify, positions, truth=inside(settings, job.truth), rig=rig)
+    points = scene.matches.to_image_points()
+    return JobResult(job.name, points, positions, result, scene.elapsed_s, scene)
+
+
+def _any_usable(job: Job | MatchJob, positions: Positions) -> bool:
+    """Tell whether there is anything to compare; all the rest of a run is worth having without."""
+    if usable(positions).any():
+        return True
+    flags = format_flags(int(np.bitwise_or.reduce(positions.flags)))
+    warnings.warn(
+        f"job {job.name!r} is not verified: none of its {len(positions)} positions can be used "
+        f"({flags.replace('|', ', ')})",
+        CloseRangeWarning,
+        stacklevel=2,
+    )
+    return False
 
 
 def _limits(job: Job) -> Limits | None:
@@ -262,41 +303,6 @@ def _offset_progress(
     return lambda done, _of: said(what, before + done, total)
 
 
-def _overlays(
-    settings: Settings,
-    detection: Detection,
-    points: ImagePoints,
-    rig: Rig | None,
-    *,
-    most: int,
-) -> list[Overlay]:
-    """Draw on at most so many images, the same number of each camera."""
-    each = max(1, most // len(detection.images))
-    crops = None if detection.crops is None else read_crops(inside(settings, detection.crops))
-    overlays = []
-    for camera, patterns in detection.images.items():
-        paths = sorted(images_of(settings, patterns), key=lambda file: natural_key(file.name))
-        named = [
-            (path, *placement_and_reading(path, detection.placement_pattern)) for path in paths
-        ]
-        # of repeated readings, whose pictures look alike, the first
-        firsts = {placement: (path, reading) for path, placement, reading in reversed(named)}
-        for placement in list(dict.fromkeys(placement for _, placement, _ in named))[:each]:
-            path, reading = firsts[placement]
-            frame = read_image(path, camera=camera)
-            overlay = make_overlay(
-                replace(frame, source=path.relative_to(settings.folder).as_posix()),
-                points,
-                placement=placement,
-                reading=reading,
-                residuals=None if rig is None else rig.residuals,
-            )
-            if crops is not None:
-                overlay = replace(overlay, xy_px=overlay.xy_px - crops[path.name])
-            overlays.append(overlay)
-    return overlays
-
-
 def _relative(text: str, settings: Settings) -> str:
     """Leave the project's folder out of a message: it belongs to the machine."""
     return text.replace(f"{settings.folder}{os.sep}", "")
@@ -304,7 +310,7 @@ def _relative(text: str, settings: Settings) -> str:
 
 def _named_files(settings: Settings) -> list[str]:
     """List the tables and targets that the project names, as they are written there."""
-    keys = ("target", "crops", "times", "control", "truth")
+    keys = ("target", "crops", "times", "control", "truth", "points")
     parts = (settings.calibration, *settings.job)
     return [name for part in parts for key in keys if (name := getattr(part, key, None))]
 
@@ -338,8 +344,12 @@ def _write_all(
     write_rig(result.rig, folder / "rig.json")
     tables = write_tables(
         folder,
-        {CALIBRATION: result.points, **{job.name: job.points for job in result.jobs}},
+        {
+            CALIBRATION: result.points,
+            **{job.name: job.points for job in result.jobs if job.scene is None},
+        },
         {job.name: job.positions for job in result.jobs},
+        {job.name: job.scene.matches for job in result.jobs if job.scene is not None},
     )
     results: list[dict[str, Any]] = []
     for job in result.jobs:
@@ -353,6 +363,11 @@ def _write_all(
         "tables": tables,
         "results": results,
         "overlays": [overlay.to_document() for overlay in overlays],
+        "scenes": [
+            {"job": job.name, **job.scene.pictures.to_document()}
+            for job in result.jobs
+            if job.scene is not None
+        ],
         "warnings": list(result.warnings),
         "provenance": {**versions(), "inputs": hashes},
     }

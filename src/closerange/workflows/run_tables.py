@@ -11,17 +11,22 @@ from closerange.errors import FileError, SchemaError
 from closerange.features.image_points import ImagePoints
 from closerange.features.points_table import read_points, write_points
 from closerange.files import MAX_TABLE_BYTES, read_limited, sha256
+from closerange.matching.correspondences import Correspondences
+from closerange.matching.matches_table import read_matches, write_matches
 from closerange.position.positions import Positions
 from closerange.position.positions_table import read_positions, write_positions
 
 CALIBRATION = "calibration"
 """Stands in the place of a job's name for the points that the rig was calibrated from."""
 
-POINTS, POSITIONS = "points", "positions"
+POINTS, POSITIONS, MATCHES = "points", "positions", "matches"
 
 
 def write_tables(
-    folder: Path, points: Mapping[str, ImagePoints], positions: Mapping[str, Positions]
+    folder: Path,
+    points: Mapping[str, ImagePoints],
+    positions: Mapping[str, Positions],
+    matches: Mapping[str, Correspondences] | None = None,
 ) -> list[dict[str, str]]:
     """Write the tables of a run.
 
@@ -29,7 +34,7 @@ def write_tables(
     ----------
     folder : Path
         Where.
-    points, positions : mapping of str to ImagePoints or Positions
+    points, positions, matches : mapping of str to ImagePoints, Positions or Correspondences
         By the name of their job.
 
     Returns
@@ -38,8 +43,12 @@ def write_tables(
         One entry a table, for ``run.json``: ``job``, ``kind``, ``file``, ``sha256``.
     """
     entries = []
+    matches = matches or {}
     for job in dict.fromkeys((*points, *positions)):
         stem = job.replace(" ", "-")
+        if job in matches:
+            write_matches(matches[job], folder / f"{stem}-matches.csv")
+            entries.append({"job": job, "kind": MATCHES, "file": f"{stem}-matches.csv"})
         if job in points:
             write_points(points[job], folder / f"{stem}-points.csv")
             entries.append({"job": job, "kind": POINTS, "file": f"{stem}-points.csv"})
@@ -51,7 +60,7 @@ def write_tables(
 
 def read_tables(
     entries: Sequence[Mapping[str, Any]], folder: Path, *, source: str
-) -> tuple[dict[str, ImagePoints], dict[str, Positions]]:
+) -> tuple[dict[str, ImagePoints], dict[str, Positions], dict[str, Correspondences]]:
     """Read the tables that a ``run.json`` names.
 
     Parameters
@@ -66,7 +75,7 @@ def read_tables(
     Returns
     -------
     tuple of dict
-        Points and positions by the name of their job.
+        Points, positions and matches by the name of their job.
 
     Raises
     ------
@@ -77,6 +86,7 @@ def read_tables(
     """
     points: dict[str, ImagePoints] = {}
     positions: dict[str, Positions] = {}
+    matches: dict[str, Correspondences] = {}
     for entry in entries:
         job, kind = str(entry["job"]), entry["kind"]
         path = _unchanged(str(entry["file"]), str(entry["sha256"]), folder, source=source)
@@ -84,12 +94,15 @@ def read_tables(
             points[job] = read_points(path)
         elif kind == POSITIONS:
             positions[job] = read_positions(path)
+        elif kind == MATCHES:
+            matches[job] = read_matches(path)
         else:
             raise SchemaError(
-                f"{source}: a table of kind {kind!r}; known kinds are {POINTS}, {POSITIONS}",
+                f"{source}: a table of kind {kind!r}; known kinds are {POINTS}, {POSITIONS}, "
+                f"{MATCHES}",
                 remedy="render it with the version of the program that wrote it",
             )
-    return points, positions
+    return points, positions, matches
 
 
 def _unchanged(name: str, digest: str, folder: Path, *, source: str) -> Path:

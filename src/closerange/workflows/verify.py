@@ -13,21 +13,24 @@ from closerange.rig.rig import Rig
 from closerange.rig.rig_file import read_rig
 from closerange.verification.acceptance import AcceptanceReport
 from closerange.verification.control_check import ControlCheck, compare_with_control
+from closerange.verification.heights import HeightCheck, height_test
 from closerange.verification.judgement import Limits
+from closerange.verification.known_parts import Parts, read_parts
 from closerange.verification.lengths import LengthCheck, Lengths, length_test, read_lengths
 from closerange.verification.single_point import single_point_test
 from closerange.verification.travel import truth_hints
 
-KINDS = ("control", "single-point", "lengths")
+KINDS = ("control", "single-point", "lengths", "heights")
 
-Result = ControlCheck | AcceptanceReport | LengthCheck
+Result = ControlCheck | AcceptanceReport | LengthCheck | HeightCheck
+Truth = ControlPoints | Lengths | Parts
 
 
 def verify(
     kind: str,
     positions: Positions | Path | str,
     *,
-    truth: ControlPoints | Lengths | Path | str,
+    truth: Truth | Path | str,
     rig: Rig | Path | str | None = None,
     limits: Limits | None = None,
     cycle_time_s: float | None = None,
@@ -39,11 +42,13 @@ def verify(
     ----------
     kind : str
         ``control`` (tables and averages for control points), ``single-point`` (accuracy and
-        repeatability by repeated readings, chapter 3) or ``lengths`` (known distances).
+        repeatability by repeated readings, chapter 3), ``lengths`` (known distances) or
+        ``heights`` (parts whose tops are known).
     positions : Positions or path
         What was measured, or its table.
-    truth : ControlPoints, Lengths or path
-        True positions (control table) or true lengths (``point_a, point_b, length_mm``).
+    truth : ControlPoints, Lengths, Parts or path
+        True positions (control table), true lengths (``point_a, point_b, length_mm``) or parts
+        (``part, shape, x_mm, y_mm, z_mm, size_x_mm, size_y_mm, rotation_deg, height_mm``).
     rig : Rig or path, optional
         With it, `control` tells fitted from check points and inside from outside the volume.
     limits : Limits, optional
@@ -55,7 +60,7 @@ def verify(
 
     Returns
     -------
-    ControlCheck, AcceptanceReport or LengthCheck
+    ControlCheck, AcceptanceReport, LengthCheck or HeightCheck
         What was found; each has `to_document`.
 
     Raises
@@ -78,6 +83,8 @@ def verify(
         positions = read_positions(positions)
     if kind == "lengths":
         return length_test(positions, _lengths(truth))
+    if kind == "heights":
+        return height_test(positions, _parts(truth))
     control = _control(truth)
     for hint in truth_hints(positions, control):
         warnings.warn(hint, CloseRangeWarning, stacklevel=2)
@@ -104,13 +111,22 @@ def _control_check(
     return compare_with_control(positions, control, fitted=fitted, volume_mm=rig.volume_mm)
 
 
-def _control(truth: ControlPoints | Lengths | Path | str) -> ControlPoints:
-    if isinstance(truth, Lengths):
-        raise InputError("true lengths given", remedy="this kind compares with true positions")
+def _control(truth: Truth | Path | str) -> ControlPoints:
+    if isinstance(truth, Lengths | Parts):
+        what = "true lengths" if isinstance(truth, Lengths) else "parts"
+        raise InputError(f"{what} given", remedy="this kind compares with true positions")
     return truth if isinstance(truth, ControlPoints) else read_control(truth)
 
 
-def _lengths(truth: ControlPoints | Lengths | Path | str) -> Lengths:
-    if isinstance(truth, ControlPoints):
-        raise InputError("true positions given", remedy="the kind lengths compares with lengths")
+def _lengths(truth: Truth | Path | str) -> Lengths:
+    if isinstance(truth, ControlPoints | Parts):
+        what = "true positions" if isinstance(truth, ControlPoints) else "parts"
+        raise InputError(f"{what} given", remedy="the kind lengths compares with lengths")
     return truth if isinstance(truth, Lengths) else read_lengths(truth)
+
+
+def _parts(truth: Truth | Path | str) -> Parts:
+    if isinstance(truth, ControlPoints | Lengths):
+        what = "true positions" if isinstance(truth, ControlPoints) else "true lengths"
+        raise InputError(f"{what} given", remedy="the kind heights compares with parts")
+    return truth if isinstance(truth, Parts) else read_parts(truth)

@@ -2,25 +2,18 @@
 
 from __future__ import annotations
 
-import re
-from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
 from closerange.delivery.ply import write_ply
-from closerange.geometry.arrays import FloatArray, IntArray
+from closerange.delivery.wire import neighbours
 from closerange.matching.correspondences import Correspondences
 from closerange.position.measure import measure_points
 from closerange.rig.rig import Rig
 
-STEEPEST = 5.0
-"""Length of a line, per the median length, above which it is left out: an edge so steep that points
-a pixel apart lie five times as far apart in space is seen at 80 degrees, where it hardly is one
-edge any more."""
-
-_NAME = re.compile(r"e(\d+)\.(\d+)")
+__all__ = ["Drawn", "neighbours", "write_wire_frame"]
 
 
 @dataclass(frozen=True, slots=True)
@@ -66,38 +59,3 @@ def write_wire_frame(rig: Rig, matches: Correspondences, path: Path | str) -> Dr
         colour_by=xyz_mm[:, 2],
     )
     return Drawn(len(point), len(lines))
-
-
-def neighbours(point: Sequence[str], xyz_mm: FloatArray) -> IntArray:
-    """Return pairs of points that follow each other on an edge.
-
-    Parameters
-    ----------
-    point : sequence of str
-        N names; ``e{chain}.{place}`` for edge points, others have no neighbours.
-    xyz_mm : ndarray, shape (N, 3)
-        Positions.
-
-    Returns
-    -------
-    ndarray of int, shape (M, 2)
-        Rows; without pairs that are much farther apart than usual, as where one edge passes
-        behind another.
-    """
-    row_of: dict[tuple[int, int], int] = {}
-    for row, name in enumerate(point):
-        found = _NAME.fullmatch(name)
-        if found:
-            row_of[int(found[1]), int(found[2])] = row
-    pairs = np.array(
-        [
-            (row, row_of[chain, place + 1])
-            for (chain, place), row in row_of.items()
-            if (chain, place + 1) in row_of
-        ],
-        dtype=np.int64,
-    ).reshape(-1, 2)
-    if not len(pairs):
-        return pairs
-    length = np.linalg.norm(xyz_mm[pairs[:, 1]] - xyz_mm[pairs[:, 0]], axis=1)
-    return np.asarray(pairs[length <= STEEPEST * np.median(length)])

@@ -183,9 +183,13 @@ def measure(
 @app.command(epilog=epilog("verify"))
 @verb
 def verify(
-    kind: Annotated[str, typer.Argument(metavar="KIND", help="control, single-point or lengths.")],
+    kind: Annotated[
+        str, typer.Argument(metavar="KIND", help="control, single-point, lengths or heights.")
+    ],
     positions: Annotated[Path, typer.Argument(metavar="POSITIONS.csv", help="What was measured.")],
-    truth: Annotated[Path, typer.Option(metavar="TABLE.csv", help="Known positions or lengths.")],
+    truth: Annotated[
+        Path, typer.Option(metavar="TABLE.csv", help="Known positions, lengths or parts.")
+    ],
     output: Annotated[Path, options.output("result.json")],
     rig: Annotated[
         Path | None,

@@ -15,9 +15,9 @@ EXAMPLES = {
     ),
     "match": (
         "closerange match closerange-demo/rig.json",
-        "left=closerange-demo/inputs/calibration/left_z+00.0.png",
-        "right=closerange-demo/inputs/calibration/right_z+00.0.png",
-        "--edges -o matches.csv",
+        "left=closerange-demo/inputs/blocks/left.png",
+        "right=closerange-demo/inputs/blocks/right.png",
+        "--edges --z -52 28 -o matches.csv --overlay match-pictures",
     ),
     "measure": (
         "closerange measure closerange-demo/rig.json",

@@ -74,17 +74,28 @@ def match(
         Path | None,
         typer.Option(metavar="wire.ply", help="Also write positions and edges in space."),
     ] = None,
+    overlay: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="FOLDER",
+            help="Also write pictures into a new folder: edges, one element and its search, all "
+            "matches by depth and by flag.",
+        ),
+    ] = None,
     _json: options.Json = False,
 ) -> Outcome:
     """Find points of one image in the images of other cameras."""
     from closerange.matching.matches_table import write_matches
     from closerange.rig.rig_file import read_rig
     from closerange.workflows.match import match_images as work
+    from closerange.workflows.match_overlay import check_folder, write_match_pictures
     from closerange.workflows.wire_frame import write_wire_frame
 
     cameras = read_rig(rig)
     named = _images(images, cameras)
     check_outputs([output, ply], [rig, points, *named.values()])
+    if overlay is not None:
+        check_folder(overlay)
     with Progress("matching") as progress:
         matched = work(
             cameras, named, points=points, edges=edges, corners=corners, z_mm=z, volume_mm=volume,
@@ -93,11 +104,15 @@ def match(
         )  # fmt: skip
     write_matches(matched.matches, output)
     keep(output)
+    if overlay is not None:
+        pictures = write_match_pictures(cameras, named, matched, overlay)
     drawn = None if ply is None else write_wire_frame(cameras, matched.matches, ply)
     summary = _summary(matched, output)
     if drawn is not None:
         summary |= {"ply": str(ply), "vertices": drawn.vertices, "lines": drawn.lines}
-    return Outcome(_text(matched, output, ply), summary, failure=_failure(matched, output))
+    if overlay is not None:
+        summary |= {"overlay": [str(path) for path in pictures]}
+    return Outcome(_text(matched, output, ply, overlay), summary, failure=_failure(matched, output))
 
 
 def _images(texts: Sequence[str], rig: Rig) -> dict[str, str]:
@@ -122,7 +137,7 @@ def _images(texts: Sequence[str], rig: Rig) -> dict[str, str]:
     return named
 
 
-def _text(matched: Matched, output: Path, ply: Path | None) -> str:
+def _text(matched: Matched, output: Path, ply: Path | None, overlay: Path | None) -> str:
     from closerange.apps.cli.screens import flags_text, lines
 
     matches = matched.matches
@@ -133,6 +148,7 @@ def _text(matched: Matched, output: Path, ply: Path | None) -> str:
         ("Flags", flags_text(matches.point_flags)),
         ("Written", output),
         ("Wire frame", ply or ""),
+        ("Pictures", overlay or ""),
     )
 
 

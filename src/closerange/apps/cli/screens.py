@@ -17,6 +17,7 @@ from closerange.position.positions import Positions
 from closerange.rig.rig import Rig
 from closerange.verification.acceptance import AcceptanceReport
 from closerange.verification.control_check import ControlCheck
+from closerange.verification.heights import HeightCheck
 from closerange.verification.lengths import LengthCheck
 from closerange.workflows.run import RunResult
 from closerange.workflows.verify import Result
@@ -145,6 +146,18 @@ def result_summary(result: Result, output: Path | None) -> dict[str, Any]:
             "max_mm": result.max_mm,
             "reservations": list(result.reservations),
         }
+    if isinstance(result, HeightCheck):
+        return summary | {
+            "kind": "heights",
+            "heights": int(result.used.sum()),
+            "points": int(result.count.sum()),
+            "rms_mm": result.rms_mm,
+            "max_mm": result.max_mm,
+            "points_median_mm": result.points_median_mm,
+            "points_p95_mm": result.points_p95_mm,
+            "missing": [list(key) for key in result.missing],
+            "reservations": list(result.reservations),
+        }
     groups = {
         name: {
             "count": group.count,
@@ -186,11 +199,27 @@ def demo_text(result: RunResult) -> str:
                 f"{len(errors)} bars of known length: worst error {micrometres(_worst(errors))}",
             )
         )
+    rows += _scene_lines(result)
     rows += [
         ("Report", result.report),
         ("Next", "closerange calibrate --help     your own cameras: docs/first-rig.md"),
     ]
     return lines(*rows)
+
+
+def _scene_lines(result: RunResult) -> list[tuple[str, object]]:
+    """Say what was matched, and how far the heights are off."""
+    rows: list[tuple[str, object]] = []
+    for job in result.jobs:
+        if job.scene is None or not isinstance(job.result, HeightCheck):
+            continue
+        matches, check = job.scene.matches, job.result
+        kept = f"{int(matches.clean.sum())} of {len(matches)} points matched and kept"
+        single = micrometres(check.points_median_mm)
+        worst = f"worst of {int(check.used.sum())} heights {micrometres(check.max_mm)}"
+        label = job.name[:12].capitalize()
+        rows.append((label, f"{kept}; a point's height is off by {single} (median), {worst}"))
+    return rows
 
 
 def run_summary(result: RunResult) -> dict[str, Any]:
@@ -216,10 +245,9 @@ def run_summary(result: RunResult) -> dict[str, Any]:
 def run_failure(result: RunResult) -> DataError | None:
     """Say which job cannot be relied upon, although its tables are written."""
     for job in result.jobs:
-        hollow = job.result.hollow if job.result is not None else ""
-        if hollow or job.positions.doubt:
+        if job.failure:
             return DataError(
-                f"job {job.name!r}: {hollow or 'its points contradict the rig, see the warning'}",
+                f"job {job.name!r}: {job.failure}",
                 remedy="look at its flags; the files are written to be looked at, not relied on",
             )
     return None
@@ -275,6 +303,11 @@ def _result_lines(result: Result) -> list[tuple[str, object]]:
     if isinstance(result, LengthCheck):
         rms, worst = micrometres(result.rms_mm), micrometres(result.max_mm)
         found = [("Lengths", f"{int(result.used.sum())}: rms {rms}, worst {worst}")]
+        return [*found, *(("Mind that", text) for text in result.reservations)]
+    if isinstance(result, HeightCheck):
+        rms, worst = micrometres(result.rms_mm), micrometres(result.max_mm)
+        single = f"single points {micrometres(result.points_median_mm)} (median)"
+        found = [("Heights", f"{int(result.used.sum())}: rms {rms}, worst {worst}; {single}")]
         return [*found, *(("Mind that", text) for text in result.reservations)]
     return _control_lines(result)
 
