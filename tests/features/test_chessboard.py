@@ -122,14 +122,14 @@ def test_both_finders_and_all_turns_give_the_same_rows(shared):
 @pytest.mark.parametrize(("rows", "columns"), [(5, 7), (6, 6)])
 def test_a_symmetric_board_must_be_upright(rows, columns):
     board = Chessboard(rows, columns, 25.0)
-    for roll in (0, 36):
+    for roll in (0, 44):
         rng = np.random.default_rng(3)
         matrix = homography(rows, columns, 36, roll, rng, squeeze=1.0)
         frame = Frame("a", board_image(rows, columns, matrix, rng))
         error = find_chessboard(frame, board).xy_px - mapped(matrix, rows, columns)
         assert np.abs(error).max() < 0.1
     matrix = homography(rows, columns, 36, 45, rng, squeeze=1.0)
-    with pytest.raises(DetectionError, match=r"same after a turn.*rolled by 4[0-9] degrees"):
+    with pytest.raises(DetectionError, match=r"same after a turn.*rolled by 4[45].[0-9] degrees"):
         find_chessboard(Frame("a", board_image(rows, columns, matrix, rng)), board)
 
 

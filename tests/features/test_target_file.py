@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from closerange.errors import FileError, InputError, SchemaError
+from closerange.errors import CloseRangeWarning, FileError, InputError, SchemaError
 from closerange.features.target import Charuco, Chessboard, DiscGrid, Target
 from closerange.features.target_file import read_target, write_target
 
@@ -39,11 +39,21 @@ def test_the_published_example_is_read(tmp_path):
 
 def test_orientation_defaults_to_marks_where_there_are_marks(tmp_path):
     text = DESIGN.replace('orientation = "upright"', "")
-    assert read_target(written(tmp_path, text)).pattern.orientation == "upright"
+    with pytest.warns(CloseRangeWarning, match=r"plate.toml: .*same after half a turn"):
+        assert read_target(written(tmp_path, text)).pattern.orientation == "upright"
     text += "mark_discs = [[0, 0, 20]]\n"
     pattern = read_target(written(tmp_path, text)).pattern
     assert pattern.orientation == "marks"
     assert pattern.mark_discs == ((0, 0, 20.0),)
+
+
+def test_only_a_symmetric_board_has_an_orientation(tmp_path):
+    board = BOARD.replace("columns = 9", "columns = 8") + 'orientation = "upright"\n'
+    assert read_target(written(tmp_path, board)).pattern == Chessboard(6, 8, 25.0, "upright")
+    assert read_target(written(tmp_path, BOARD)).pattern.orientation == ""
+    for text in (BOARD + 'orientation = "upright"', board.replace("upright", "marks")):
+        with pytest.raises(SchemaError, match="orientation = .*two odd or two even"):
+            read_target(written(tmp_path, text))
 
 
 def test_a_single_disc_needs_no_pitch(tmp_path):
@@ -60,6 +70,7 @@ def test_a_single_disc_needs_no_pitch(tmp_path):
         Target.of(DiscGrid(3, 4, (45.5, 0.1 + 30.2), 16.1), std_mm=0.013),
         Target.of(DiscGrid(9, 12, (10, 10), 5.8, "dark-on-white", mark_discs=((2, 3, 8.0),))),
         Target.of(Chessboard(6, 9, 25.0)),
+        Target.of(Chessboard(6, 8, 25.0, "upright")),
         Target.of(Charuco(4, 5, 54.0, 40.0, "DICT_5X5_100"), std_mm=1e-7),
         Target.of_points(("01", "1", "a b"), [[0.1, 0, 0], [1, 2, 3], [4, 5, 6]], std_mm=[0, 1, 2]),
     ],

@@ -97,8 +97,13 @@ def _what(contents: Contents) -> str:
             texts.append(counted(count, "control point"))
     lengths = sum(len(check["rows"]["flags"]) for check in contents.checks_of("lengths"))
     texts += [counted(lengths, "known length")] if lengths else []
-    heights = sum(sum(check["rows"]["used"]) for check in contents.checks_of("heights"))
-    texts += [counted(heights, "known height")] if heights else []
+    heights = {
+        (check["rows"]["placement"][row], part)
+        for check in contents.checks_of("heights")
+        for row, part in enumerate(check["rows"]["part"])
+        if check["rows"]["used"][row]
+    }
+    texts += [counted(len(heights), "known height")] if heights else []
     if not texts and contents.positions:
         count = sum(len(positions) for positions in contents.positions.values())
         texts.append(counted(count, "position"))
@@ -141,8 +146,9 @@ def _how_accurate(contents: Contents) -> str:
         largest_height = short_length(float(numbers(check["max_mm"])))
         median = short_length(float(numbers(check["points_median_mm"])))
         job = f" ({check['job']})" if check.get("job") else ""
-        single = f"of a single point {median} (median)"
-        texts.append(f"Error of a height{job}: at most {largest_height}; {single}.")
+        several = any(count > 1 for count in check["rows"]["count"])
+        single = f"; of a single point {median} (median)" if several else ""
+        texts.append(f"Error of a height{job}: at most {largest_height}{single}.")
     trust = contents.rig.trust if contents.rig is not None else None
     if trust is not None and not texts:
         texts.append(f"Predicted standard deviation {three_micrometres(trust.predicted_mm)}.")
@@ -243,8 +249,9 @@ def _from_rows(contents: Contents) -> Iterator[Reason]:
             yield Reason(f"no flag on any of {counted(total, 'measured position')}", "for")
     for job, matches in contents.matches.items():
         kept, of_job = int(matches.clean.sum()), f" of job {job}" if job else ""
-        text = f"{kept} of {counted(len(matches), 'matched point')}{of_job} carry no flag; only"
-        yield Reason(f"{text} these are used", "note")
+        if kept < len(matches):
+            text = f"{kept} of {counted(len(matches), 'matched point')}{of_job} carry no flag; only"
+            yield Reason(f"{text} these are used", "note")
     reserved = [text for check in contents.checks for text in check.get("reservations") or ()]
     yield from (Reason(text, "against") for text in dict.fromkeys(reserved))
     others = [check for check in contents.checks if not check.get("reservations")]

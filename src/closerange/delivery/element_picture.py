@@ -18,8 +18,9 @@ from closerange.matching.literal_element import farthest_plane, footprint
 from closerange.matching.search import epipolar_segment, plane_mapping
 from closerange.rig.camera import Camera
 
-SIZES_PX = (15, 31, 59)
-"""Sides of elements that are tried: those of the thesis' examples 1 and 2, and one between."""
+SIZES_PX = (15, 31, 59, 121)
+"""Sides of elements, of which the smallest that an edge crosses is taken: those of the thesis'
+examples 1 and 2, one between, and one for faces whose middle is far from their edges."""
 
 TRIED = 200
 """Points among which one is chosen for the picture."""
@@ -207,6 +208,8 @@ def element_picture(
     masks: Sequence[BoolArray],
     matches: Correspondences,
     volume_mm: FloatArray,
+    *,
+    sizes_px: Sequence[int] = SIZES_PX,
 ) -> ElementPicture | None:
     """Choose one matched point and show how a structuring element finds it.
 
@@ -218,6 +221,8 @@ def element_picture(
         What the program found.
     volume_mm : ndarray, shape (2, 3)
         Where it was sought.
+    sizes_px : sequence of int, optional
+        Sides of elements, odd and ascending.
 
     Returns
     -------
@@ -232,37 +237,38 @@ def element_picture(
     if not clean.size or not np.isfinite(plane[1]):
         return None
     rows = clean[:: 1 + len(clean) // TRIED]
-    searches = _searches((first, second), (masks[0], masks[1]), matches, rows, volume_mm)
+    near = matches.select(rows)
+    searches = _searches((first, second), (masks[0], masks[1]), near, volume_mm, sizes_px)
     if not searches:
         return None
     chosen = max(searches, key=lambda search: search.margin)
-    return _picture(chosen, greys, masks, matches, ("XYZ"[plane[0]], plane[1]))
+    return _picture(chosen, greys, masks, near, ("XYZ"[plane[0]], plane[1]))
 
 
 def _searches(
     cameras: tuple[Camera, Camera],
     masks: tuple[BoolArray, BoolArray],
     matches: Correspondences,
-    rows: IntArray,
     volume_mm: FloatArray,
+    sizes_px: Sequence[int],
 ) -> list[_Search]:
-    """Scan the elements of some points; keep those that agree with the program's matches."""
+    """Scan the elements of points; keep those that agree with the program's matches."""
     axis, offset = farthest_plane(*cameras, volume_mm)
-    seeds = matches.xy_px[rows, 0]
+    seeds = matches.xy_px[:, 0]
     segments = epipolar_segment(*cameras, seeds, volume_mm)
     depth_mm = segments.xyz_mm[..., axis]
     found = []
-    for place, row in enumerate(rows.tolist()):
-        size_px, element = _element(masks[0], seeds[place])
-        count = int(segments.count[place])
+    for row in range(len(matches)):
+        size_px, element = _element(masks[0], seeds[row], sizes_px)
+        count = int(segments.count[row])
         if not len(element) or count == 0:
             continue
-        both = np.concatenate([element, np.rint(seeds[place])[None]]).astype(np.float64)
+        both = np.concatenate([element, np.rint(seeds[row])[None]]).astype(np.float64)
         mapped = plane_mapping(*cameras, both, normal=np.eye(3)[axis], offset_mm=offset).xy_px
         if not all_finite(mapped, (0, 1)):
             continue
         offsets = np.unique(np.rint(mapped[:-1] - mapped[-1]).astype(np.int64), axis=0)
-        places = segments.xy_px[place, :count]
+        places = segments.xy_px[row, :count]
         present = _present(masks[1], np.rint(places).astype(np.int64)[:, None] + offsets)
         search = _Search(
             row,
@@ -270,7 +276,7 @@ def _searches(
             element,
             offsets,
             places,
-            depth_mm[place, :count],
+            depth_mm[row, :count],
             np.asarray((~present).sum(axis=1), np.int64),
         )
         away = np.linalg.norm(places[search.best] - matches.xy_px[row, 1])
@@ -279,18 +285,18 @@ def _searches(
     return found
 
 
-def _element(mask: BoolArray, seed_px: FloatArray) -> tuple[int, IntArray]:
+def _element(mask: BoolArray, seed_px: FloatArray, sizes_px: Sequence[int]) -> tuple[int, IntArray]:
     """Return side and edge pixels of the smallest element that an edge crosses."""
     centre = np.rint(seed_px).astype(np.int64)
-    ys, xs = np.nonzero(footprint(SIZES_PX[-1]))
-    reach = SIZES_PX[-1] // 2
+    ys, xs = np.nonzero(footprint(sizes_px[-1]))
+    reach = sizes_px[-1] // 2
     around = np.column_stack([xs - reach, ys - reach])
     around = around[_present(mask, around + centre)]
-    for size in SIZES_PX:
+    for size in sizes_px:
         inside = around[np.abs(around).max(axis=1, initial=0) <= size // 2]
         if len(inside) >= size:
             return size, np.asarray(inside + centre, np.int64)
-    return SIZES_PX[-1], np.asarray(around + centre, np.int64)
+    return sizes_px[-1], np.asarray(around + centre, np.int64)
 
 
 def _present(mask: BoolArray, pixel: IntArray) -> BoolArray:
@@ -321,7 +327,7 @@ def _picture(
         crops=(
             _crop(greys[0], masks[0], corners),
             _crop(greys[1], masks[1], np.concatenate([mapped, match[None]])),
-            _crop(greys[1], masks[1], search.places),
+            _crop(greys[1], masks[1], np.concatenate([search.places, mapped])),
         ),
         seed_px=_pair(seed),
         match_px=_pair(match),

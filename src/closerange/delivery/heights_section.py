@@ -92,10 +92,9 @@ def _table(rows: Mapping[str, Any]) -> Block:
 
 def _figure(rows: Mapping[str, Any]) -> Figure:
     error, std = (1000 * numbers(rows[f"{name}_mm"]) for name in ("error", "std"))
-    caption = (
-        "Error of each height (measured minus actual) in the order of the table; bars reach one "
-        "standard deviation of a single point up and down."
-    )
+    caption = "Error of each height (measured minus actual) in the order of the table"
+    if np.isfinite(std).any():
+        caption += "; bars reach one standard deviation of a single point up and down"
     panel = Panel(
         x=np.arange(1.0, len(error) + 1),
         y=error,
@@ -107,4 +106,4 @@ def _figure(rows: Mapping[str, Any]) -> Figure:
         levels=(Level(0.0, ""),),
     )
     picture = panel_grid([panel], columns=1, height=150, title="Heights", description=caption)
-    return Figure(picture, caption)
+    return Figure(picture, f"{caption}.")

@@ -40,6 +40,7 @@ _OTHER_FLAGS = "#9a9a9a"
 
 _GAP = 8.0
 _DOT_PX = 1.3  # radius on a layer of MAX_WIDTH_PX columns: neighbours on an edge nearly touch
+_FEW, _FEW_DOT_PX = 100, 4.5  # so few points do not make lines: they are drawn as dots
 _LAYER = 2  # pixels of a layer for each pixel of the stored picture
 
 ELEMENT, MISSING, PLACE = "#ffe14d", "#ff4d4d", "#ffffff"
@@ -231,7 +232,9 @@ def _marked(
         layer = (columns, max(1, round(view.size_px[1] * scale)))
         # pixel (0, 0) is a centre: the picture's corner is at (-0.5, -0.5)
         there = (mark.xy_px + 0.5) * scale - 0.5
-        dots = dot_layer(layer, there, mark.colours, radius=_DOT_PX * _LAYER)
+        few = len(mark.colours) <= _FEW
+        radius = (_FEW_DOT_PX if few else _DOT_PX) * _LAYER
+        dots = dot_layer(layer, there, mark.colours, radius=radius)
         canvas.picture(corner, size, dots, "png")
         _frame(canvas, corner, size)
         seen = int(np.isfinite(mark.xy_px).all(axis=1).sum())

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from closerange.delivery.canvas import base64_of
-from closerange.delivery.element_picture import ElementPicture, element_picture
+from closerange.delivery.element_picture import SIZES_PX, ElementPicture, element_picture
 from closerange.delivery.overlays import MAX_WIDTH_PX
 from closerange.errors import SchemaError
 from closerange.features.edge_operators import blur_minimum, edge_mask
@@ -72,6 +72,8 @@ class ScenePictures:
 
     Attributes
     ----------
+    method : str
+        ``default``, or ``literal`` for that of the thesis.
     volume_mm : tuple of (tuple of float or None)
         Lower and upper corner of where points were sought; None where there was no limit.
     views : tuple of ViewPicture
@@ -83,6 +85,7 @@ class ScenePictures:
         same face in the second view) and ``expected_px``; see `closerange.workflows.match_scene`.
     """
 
+    method: str
     volume_mm: tuple[tuple[float | None, ...], ...]
     views: tuple[ViewPicture, ...]
     element: ElementPicture | None
@@ -96,6 +99,7 @@ class ScenePictures:
         """Return a JSON-ready document."""
         return {
             "schema": SCHEMA,
+            "method": self.method,
             "volume_mm": [list(corner) for corner in self.volume_mm],
             "views": [
                 {
@@ -142,6 +146,7 @@ class ScenePictures:
             low, high = document["volume_mm"]
             element = document["element"]
             return cls(
+                str(document["method"]),
                 (_corner(low), _corner(high)),
                 tuple(_view(entry) for entry in document["views"]),
                 None if element is None else ElementPicture.from_document(element),
@@ -160,6 +165,8 @@ def scene_pictures(
     matches: Correspondences,
     volume_mm: FloatArray,
     *,
+    method: str = "default",
+    element_px: int | None = None,
     centroids: Sequence[Mapping[str, Any]] = (),
 ) -> ScenePictures:
     """Make the pictures of a matched scene.
@@ -174,6 +181,10 @@ def scene_pictures(
         What was found.
     volume_mm : ndarray, shape (2, 3)
         Where it was sought; infinite where there was no limit.
+    method : str, optional
+        How it was sought: ``default`` or ``literal``.
+    element_px : int, optional
+        Side of the structuring element that is shown; chosen for each point without it.
     centroids : sequence of mapping, optional
         See `ScenePictures`.
 
@@ -209,8 +220,9 @@ def scene_pictures(
         masks[:2],
         matches,
         volume_mm,
+        sizes_px=SIZES_PX if element_px is None else (element_px,),
     )
-    return ScenePictures(limits, tuple(views), element, tuple(centroids))
+    return ScenePictures(method, limits, tuple(views), element, tuple(centroids))
 
 
 def dimmed(pixels: NDArray[Any]) -> NDArray[np.uint8]:

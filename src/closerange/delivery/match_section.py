@@ -56,6 +56,9 @@ ADVICE: dict[Flag, str] = {
 }
 """What to do about a flag of a match."""
 
+FEWEST = 20
+"""Points without which there is nothing to be seen in a histogram or in space."""
+
 _OTHERWISE = "look at the point in the picture below"
 
 
@@ -73,11 +76,15 @@ def match_sections(contents: Contents) -> list[Section]:
         In the order of the jobs.
     """
     sections = []
+    shown_before: set[ViewPicture] = set()
     for number, (job, matches) in enumerate(contents.matches.items(), start=1):
         title = f"Matches: {job}" if job else "Matches"
-        blocks = _blocks(
-            matches, contents.positions.get(job), contents.scenes.get(job), contents.rig
-        )
+        scene = contents.scenes.get(job)
+        blocks = _blocks(matches, contents.positions.get(job), scene, contents.rig)
+        views = scene.views if scene is not None else ()
+        if views and not shown_before.issuperset(views):  # one scene may be matched twice
+            blocks.insert(2, _strengths(views))
+        shown_before.update(views)
         sections.append(Section(f"matches-{number}", title, tuple(blocks)))
     return sections
 
@@ -88,7 +95,8 @@ def _blocks(
     scene: ScenePictures | None,
     rig: Rig | None,
 ) -> list[Block]:
-    blocks: list[Block] = [Paragraph(_summary(matches, scene)), _flags_table(matches)]
+    blocks: list[Block] = [Paragraph(_summary(matches, scene))]
+    blocks += [_flags_table(matches)] if matches.point_flags.any() else []
     cameras = [rig.camera(name) for name in matches.cameras] if rig is not None else []
     axis = int(np.argmax(np.abs(mean_direction(cameras)))) if cameras else 2
     place = _places(matches, positions)
@@ -98,7 +106,7 @@ def _blocks(
     if scene is not None:
         blocks += _centroids(scene.centroids, matches.cameras)
         blocks += _pictures(matches, scene, place, kept, axis)
-    if rig is not None and kept.any():
+    if rig is not None and int(kept.sum()) >= FEWEST:
         blocks.append(_wire(matches, place, kept, axis, rig))
     return blocks
 
@@ -108,13 +116,20 @@ def _summary(matches: Correspondences, scene: ScenePictures | None) -> str:
     given = matches.found[:, 0]
     kept = matches.clean
     share = percent(float(kept.sum() / max(given.sum(), 1)))
-    volume = f", {_volume_text(scene)}" if scene is not None else ""
+    volume = f", {_volume_text(scene)}, {_method_text(scene)}" if scene is not None else ""
     return (
         f"{counted(int(given.sum()), 'point')} of camera {first} were sought in "
         f"{' and '.join(others)}{volume}. {int(matches.matched.sum())} have a place in at least "
         f"two views; {int(kept.sum())} ({share}) were kept: at least two views see them without "
         "a flag."
     )
+
+
+def _method_text(scene: ScenePictures) -> str:
+    if scene.method == "literal":
+        side = f", {scene.element.size_px} px," if scene.element is not None else ""
+        return f"by the thesis' structuring element{side} to whole pixels"
+    return "by the program's matcher"
 
 
 def _volume_text(scene: ScenePictures) -> str:
@@ -174,6 +189,9 @@ def _precision(
             "volume, where the error may be larger."
         )
     head = ("axis", "5 % are below [µm]", "median [µm]", "95 % are below [µm]")
+    table = Table("Predicted standard deviation of kept points", head, cells)
+    if len(own) < FEWEST:
+        return [Paragraph(text), table]
     name = "XYZ"[axis]
     picture = draw_histograms(
         [
@@ -187,11 +205,7 @@ def _precision(
         "Kept points: predicted standard deviation along the view, and how badly the views fit "
         "there. The last bar holds the uppermost hundredth as well."
     )
-    return [
-        Paragraph(text),
-        Table("Predicted standard deviation of kept points", head, cells),
-        Figure(picture.render(), caption),
-    ]
+    return [Paragraph(text), table, Figure(picture.render(), caption)]
 
 
 def _centroids(entries: Sequence[Mapping[str, Any]], cameras: tuple[str, ...]) -> list[Block]:
@@ -235,23 +249,21 @@ def _pictures(
     if not views:
         return []
     marks = [matches.xy_px[:, column] for _, column in pairs]
-    blocks: list[Block] = [
-        Figure(
-            draw_strengths(views).render(),
-            "Edge strength of the images by the blur-minimum operator; a pixel above Trussell's "
-            "threshold is an edge pixel.",
-        )
-    ]
+    blocks: list[Block] = []
     if scene.element is not None:
         element = scene.element
         axis_name, offset = element.plane
         caption = (
-            f"How a structuring element finds point {element.point}, at the coordinates of image "
-            "1: the edge pixels around it are carried into the second view through the plane "
-            f"{axis_name} = {fixed(offset, 1)} mm and moved along the epipolar segment. Where the "
-            "fewest of them are missing is its match. The program's own matcher refines this to a "
-            "fraction of a pixel, by oriented edges and their neighbours."
+            f"How a structuring element finds point {element.point}: the edge pixels around it are "
+            f"carried into the second view through the plane {axis_name} = {fixed(offset, 1)} mm "
+            "and moved along the epipolar segment. Where the fewest of them are missing is its "
+            "match."
         )
+        if scene.method != "literal":
+            caption += (
+                " The program's matcher finds places by oriented edges and their neighbours, to a "
+                "fraction of a pixel."
+            )
         blocks.append(Figure(draw_element(element).render(), caption))
     if kept.any():
         name = "XYZ"[axis]
@@ -261,6 +273,8 @@ def _pictures(
             "has the colour of the end."
         )
         blocks.append(Figure(drawing.render(), caption))
+    if not matches.point_flags.any():
+        return blocks
     caption = (
         "All points, coloured by flag; where one carries several, by the rarest. In the further "
         "views a flagged point stands where the matcher would place it."
@@ -268,6 +282,14 @@ def _pictures(
     flags = draw_flags(views, marks, matches.point_flags)
     blocks.append(Figure(flags.render(), caption))
     return blocks
+
+
+def _strengths(views: Sequence[ViewPicture]) -> Figure:
+    return Figure(
+        draw_strengths(views).render(),
+        "Edge strength of the images by the blur-minimum operator; a pixel above Trussell's "
+        "threshold is an edge pixel.",
+    )
 
 
 def _wire(

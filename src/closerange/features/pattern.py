@@ -85,6 +85,12 @@ class DiscGrid:
             diameters[row, column] = diameter
         return diameters.ravel()
 
+    @property
+    def half_turn_symmetric(self) -> bool:
+        """Whether the grid looks the same after a half turn."""
+        diameters = self.diameters_mm
+        return len(diameters) > 1 and bool(np.array_equal(diameters, diameters[::-1]))
+
     def _check_mark(self, mark: tuple[int, int, float]) -> None:
         row, column, diameter = mark
         if not (0 <= row < self.rows and 0 <= column < self.columns):
@@ -148,6 +154,9 @@ class Chessboard:
         Inner corners, at least 3.
     square_mm : float
         Side of a square, mm.
+    orientation : str
+        ``"upright"`` says that a board that looks the same after a half turn is held upright in
+        every image; left blank, that is assumed with a warning.
 
     Raises
     ------
@@ -158,10 +167,17 @@ class Chessboard:
     rows: int
     columns: int
     square_mm: float
+    orientation: str = ""
 
     def __post_init__(self) -> None:
         _check_counts(self.rows, self.columns, least=3, cells=self.rows * self.columns)
         _check_length("square_mm", self.square_mm)
+        if self.orientation and (self.orientation != "upright" or not self.half_turn_symmetric):
+            raise refuse_value(
+                "orientation",
+                self.orientation,
+                "only a board of two odd or two even numbers has one, and it is upright",
+            )
 
     @property
     def half_turn_symmetric(self) -> bool:

@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import json
 import tomllib
+import warnings
 from collections.abc import Callable
 from pathlib import Path, PurePosixPath, PureWindowsPath
 from typing import Any
 
-from closerange.errors import SchemaError
+from closerange.errors import CloseRangeWarning, SchemaError
 from closerange.features.control import ControlPoints, read_control, write_control
 from closerange.features.target import Charuco, Chessboard, DiscGrid, Target
 from closerange.files import read_text, write_text
@@ -24,12 +25,13 @@ def read_target(path: Path | str) -> Target:
 
         disc-grid    rows, columns, pitch_mm = [x, y], disc_diameter_mm, polarity,
                      [orientation], [mark_discs = [[row, column, diameter_mm], ...]], [std_mm]
-        chessboard   rows, columns (inner corners), square_mm, [std_mm]
+        chessboard   rows, columns (inner corners), square_mm, [orientation], [std_mm]
         charuco      rows, columns (squares), square_mm, marker_mm, dictionary, [std_mm]
         points       file (a control table in the target's frame, in the same folder or below)
 
     `orientation`, left out, is ``"marks"`` where there are `mark_discs` and ``"upright"``
-    where there are none. `pitch_mm` may be left out for a single disc. `std_mm`, left out,
+    where there are none; a chessboard has one only where it looks the same after a half turn.
+    `pitch_mm` may be left out for a single disc. `std_mm`, left out,
     is 0: the target counts as exact.
 
     Parameters
@@ -51,6 +53,11 @@ def read_target(path: Path | str) -> Target:
         names file, key, value and limit.
     TableError
         If the table of a "points" target breaks its contract.
+
+    Warns
+    -----
+    CloseRangeWarning
+        If a disc grid looks the same after a half turn and the file does not say how it is held.
     """
     path = Path(path)
     document = _parse(path)
@@ -94,8 +101,7 @@ def write_target(target: Target, path: Path | str) -> None:
         lines["file"] = table.name
     else:
         lines |= {name: getattr(pattern, name) for name in pattern.__dataclass_fields__}
-        if not lines.get("mark_discs", True):
-            del lines["mark_discs"]
+        lines = {key: value for key, value in lines.items() if value not in ((), "")}
         if target.std_mm.any():
             lines["std_mm"] = float(target.std_mm[0])
     write_text(path, "".join(f"{key} = {_toml(value)}\n" for key, value in lines.items()))
@@ -111,9 +117,7 @@ def _disc_grid(document: dict[str, Any], path: Path) -> Target:
         pitch = (2 * diameter, 2 * diameter)  # never used: a single disc has no neighbour
     else:
         raise _missing("pitch_mm", where)
-    orientation = _text(document, "orientation", where) if "orientation" in document else ""
-    if "orientation" in document and not orientation:
-        raise _wrong("orientation", "", "upright or marks", where)
+    orientation = _orientation(document, "upright or marks", where)
     grid = DiscGrid(
         rows=rows,
         columns=columns,
@@ -123,7 +127,25 @@ def _disc_grid(document: dict[str, Any], path: Path) -> Target:
         orientation=orientation,
         mark_discs=_marks(document.get("mark_discs", []), where),
     )
+    if not orientation and grid.half_turn_symmetric:
+        warnings.warn(
+            f"{where}: a grid of {rows} x {columns} discs looks the same after half a turn: it is "
+            "taken to be upright in every image, an upside-down one goes unnoticed; write "
+            'orientation = "upright" where that holds, or use mark discs',
+            CloseRangeWarning,
+            stacklevel=4,
+        )
     return Target.of(grid, std_mm=_std(document, where))
+
+
+def _orientation(document: dict[str, Any], wanted: str, where: str) -> str:
+    """Return the orientation, blank where the file does not say."""
+    if "orientation" not in document:
+        return ""
+    orientation = _text(document, "orientation", where)
+    if not orientation:
+        raise _wrong("orientation", "", wanted, where)
+    return orientation
 
 
 def _chessboard(document: dict[str, Any], path: Path) -> Target:
@@ -132,6 +154,7 @@ def _chessboard(document: dict[str, Any], path: Path) -> Target:
         rows=_whole(document, "rows", where),
         columns=_whole(document, "columns", where),
         square_mm=_number(document, "square_mm", where),
+        orientation=_orientation(document, "upright", where),
     )
     return Target.of(board, std_mm=_std(document, where))
 
@@ -167,7 +190,7 @@ _READERS: dict[str, _Reader] = {
         ("pitch_mm", "orientation", "mark_discs", "std_mm"),
         _disc_grid,
     ),
-    "chessboard": (("rows", "columns", "square_mm"), ("std_mm",), _chessboard),
+    "chessboard": (("rows", "columns", "square_mm"), ("orientation", "std_mm"), _chessboard),
     "charuco": (
         ("rows", "columns", "square_mm", "marker_mm", "dictionary"),
         ("std_mm",),

@@ -40,6 +40,9 @@ WARM_UP = 32
 """Points before and after such a piece from which messages are sent into it. What lies further
 away has no say: after a few steps the limited costs have forgotten the start."""
 
+AT_ONCE = 20_000
+"""Pairs of neighbours whose steps are priced at once: 25 MB for each intermediate result."""
+
 NEVER = np.float32(1e6)
 
 
@@ -167,7 +170,10 @@ class _Grid:
 def _messages(first: EdgePoints, grid: _Grid) -> np.ndarray[tuple[int, int], np.dtype[np.float32]]:
     """Return what every point hears from both sides of its chain, shape (N, K + 1)."""
     link = np.flatnonzero(first.after >= 0)
-    price = grid.steps(link, first.after[link])
+    price = np.empty((len(link), *[grid.unary.shape[1]] * 2), dtype=np.float32)
+    for start in range(0, len(link), AT_ONCE):
+        some = link[start : start + AT_ONCE]
+        price[start : start + AT_ONCE] = grid.steps(some, first.after[some])
     number = np.full(len(first), -1, dtype=np.int64)
     number[link] = np.arange(len(link))
     layout = _layout(first)

@@ -163,11 +163,12 @@ def _frames(sources: Iterable[Path | Frame], camera: str) -> Iterator[Frame]:
 
 def _warn_if_symmetric(target: Target) -> None:
     board = target.pattern
-    if isinstance(board, Chessboard) and board.half_turn_symmetric:
+    if isinstance(board, Chessboard) and board.half_turn_symmetric and not board.orientation:
         warnings.warn(
             f"a board of {board.rows} x {board.columns} inner corners looks the same after half a "
             "turn: it is taken to be upright in every image, an upside-down one goes unnoticed; a "
-            "board with one odd and one even number has no such doubt",
+            "board with one odd and one even number has no such doubt; where this one is held "
+            'upright, write orientation = "upright" into its file',
             CloseRangeWarning,
             stacklevel=3,
         )

@@ -23,7 +23,7 @@ from closerange.matching.search import plane_mapping
 from closerange.position.positions import Positions
 from closerange.rig.rig import Rig
 from closerange.settings import MatchJob, Settings, images_of, inside
-from closerange.workflows.match import Matched, match_images
+from closerange.workflows.match import LITERAL_PX, Matched, match_images
 from closerange.workflows.match_inputs import read_frames
 from closerange.workflows.measure import measure
 
@@ -103,7 +103,16 @@ def match_scene(
     elapsed_s = time.perf_counter() - start
     own = [_named(frame, settings) for frame in frames.values()]
     centroids = _compare(rig, frames, matched, positions) if job.match == "centroids" else ()
-    pictures = scene_pictures(rig, own, matched.matches, matched.volume_mm, centroids=centroids)
+    literal = job.method == "literal"
+    pictures = scene_pictures(
+        rig,
+        own,
+        matched.matches,
+        matched.volume_mm,
+        method=job.method,
+        element_px=(job.element_px or LITERAL_PX) if literal else None,
+        centroids=centroids,
+    )
     return MatchedScene(matched.matches, positions, pictures, elapsed_s)
 
 

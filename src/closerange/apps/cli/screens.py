@@ -215,10 +215,9 @@ def _scene_lines(result: RunResult) -> list[tuple[str, object]]:
             continue
         matches, check = job.scene.matches, job.result
         kept = f"{int(matches.clean.sum())} of {len(matches)} points matched and kept"
-        single = micrometres(check.points_median_mm)
-        worst = f"worst of {int(check.used.sum())} heights {micrometres(check.max_mm)}"
-        label = job.name[:12].capitalize()
-        rows.append((label, f"{kept}; a point's height is off by {single} (median), {worst}"))
+        single = f"{micrometres(check.points_median_mm)} (median point)"
+        worst = f"{micrometres(check.max_mm)} (worst of {int(check.used.sum())} parts)"
+        rows.append((job.name[:12].capitalize(), f"{kept}; heights off by {single}, {worst}"))
     return rows
 
 
