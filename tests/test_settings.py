@@ -7,7 +7,7 @@ from importlib.resources import as_file, files
 import pytest
 
 from closerange.errors import FileError, SchemaError
-from closerange.settings import images_of, inside, read_settings
+from closerange.settings import MatchJob, images_of, inside, read_settings
 
 GOOD = """
 schema = "closerange.project/1"
@@ -58,12 +58,14 @@ def test_a_project_without_jobs_only_calibrates(project):
 def test_the_shipped_project_reads_and_its_files_exist():
     with as_file(files("closerange.workflows") / "demo_data") as folder:
         settings = read_settings(folder / "closerange.toml")
-        assert [job.name for job in settings.job] == ["single-point", "bars across", "bars along"]
+        names = ["single-point", "bars across", "bars along", "blocks", "centroids"]
+        assert [job.name for job in settings.job] == names
         counts = []
         for part in (settings.calibration, *settings.job):
-            assert inside(settings, part.target).is_file()
+            table = part.truth if isinstance(part, MatchJob) else part.target
+            assert inside(settings, table).is_file()
             counts += [len(images_of(settings, part.images[name])) for name in ("left", "right")]
-    assert counts == [7, 7, 270, 270, 5, 5, 2, 2]
+    assert counts == [7, 7, 270, 270, 5, 5, 2, 2, 1, 1, 1, 1]
 
 
 @pytest.mark.parametrize(
@@ -208,3 +210,53 @@ def test_limits_without_a_single_point_test(project):
     text = 'verify = "lengths"\ntruth = "truth.csv"\nlimits = { accuracy_mm = 1.0 }\n'
     with pytest.raises(SchemaError, match="limits are those of"):
         read_settings(project('verify = "single-point"\ntruth = "truth.csv"\n', text))
+
+
+SCENE = """
+[[job]]
+name = "blocks"
+match = "edges"
+images = { left = ["l.png"], right = ["r.png"] }
+z_mm = [-50.0, 25.0]
+verify = "heights"
+truth = "parts.csv"
+"""
+
+
+def with_scene(tmp_path, old="", new=""):
+    assert old in SCENE
+    path = tmp_path / "closerange.toml"
+    path.write_text(GOOD + SCENE.replace(old, new, 1), encoding="utf-8")
+    return path
+
+
+def test_a_job_that_matches_beside_one_that_detects(tmp_path):
+    first, second = read_settings(with_scene(tmp_path)).job
+    assert (first.name, second.name) == ("one disc", "blocks")
+    assert isinstance(second, MatchJob)
+    assert (second.method, second.element_px, second.points) == ("default", None, None)
+    assert second.z_mm == [-50.0, 25.0]
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "where"),
+    [
+        ('match = "edges"', 'match = "faces"', "job.1.match"),
+        ('match = "edges"', 'match = "edges"\ntarget = "disc.toml"', "job.1.target"),
+        ('match = "edges"', 'match = "points"', "points go with match"),
+        ('match = "edges"', 'match = "edges"\npoints = "p.csv"', "points go with match"),
+        (', right = ["r.png"]', "", "job.1.images"),
+        ("z_mm = [-50.0, 25.0]", "z_mm = [-50.0]", "job.1.z_mm"),
+        (
+            "z_mm = [-50.0, 25.0]",
+            "z_mm = [-50.0, 25.0]\nvolume_mm = [0.0, 0.0, 0.0, 1.0, 1.0, 1.0]",
+            "exclude each other",
+        ),
+        ('truth = "parts.csv"', "", "verify and truth go together"),
+        ('verify = "heights"', 'verify = "lengths"', "job.1.verify"),
+        ('name = "blocks"', 'name = "one disc"', "its own name"),
+    ],
+)
+def test_a_job_that_matches_is_checked(tmp_path, old, new, where):
+    with pytest.raises(SchemaError, match=where):
+        read_settings(with_scene(tmp_path, old, new))

@@ -15,7 +15,7 @@ from closerange.apps.cli import app
 from closerange.version import __version__
 
 DEMO = Path(str(files("closerange.workflows") / "demo_data"))
-VERBS = ("detect", "calibrate", "measure", "verify", "run", "demo", "report")
+VERBS = ("detect", "calibrate", "match", "measure", "verify", "run", "demo", "report")
 HEIGHTS = ("z-50.0", "z+00.0", "z+50.0")
 SIZES = ("--image-size", "left=640x512", "--image-size", "right=640x512")
 CUBE = ("--volume", "-50", "-50", "-50", "50", "50", "50")

@@ -48,6 +48,7 @@ def shown(tmp_path_factory):
     [
         ("detect", ["left.csv"]),
         ("calibrate", ["rig.json"]),
+        ("match", ["matches.csv"]),
         ("measure", ["positions.csv"]),
         ("verify", ["result.json", "report.html"]),
         ("run", ["closerange-demo/inputs/results/report.html"]),

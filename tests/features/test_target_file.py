@@ -52,7 +52,7 @@ def test_only_a_symmetric_board_has_an_orientation(tmp_path):
     assert read_target(written(tmp_path, board)).pattern == Chessboard(6, 8, 25.0, "upright")
     assert read_target(written(tmp_path, BOARD)).pattern.orientation == ""
     for text in (BOARD + 'orientation = "upright"', board.replace("upright", "marks")):
-        with pytest.raises(SchemaError, match="orientation = .*two odd or two even"):
+        with pytest.raises(SchemaError, match=r"orientation = .*two odd or two even"):
             read_target(written(tmp_path, text))
 
 

@@ -44,7 +44,9 @@ def test_the_demonstration_writes_its_folder(shown):
     result, steps = shown
     stems = ("single-point", "bars-across", "bars-along")
     tables = [f"{stem}-{what}.csv" for stem in stems for what in ("points", "positions")]
-    wanted = [*tables, *(f"{stem}-result.json" for stem in stems)]
+    scenes = ("blocks", "centroids")
+    tables += [f"{stem}-{what}.csv" for stem in scenes for what in ("matches", "positions")]
+    wanted = [*tables, *(f"{stem}-result.json" for stem in (*stems, *scenes))]
     wanted += ["calibration-points.csv", "rig.json", "run.json", "report.html"]
     assert sorted(contents(result.folder)) == sorted(wanted)
     assert [path.name for path in result.folder.parent.iterdir()] == ["results"]
@@ -72,9 +74,30 @@ def test_figures_of_the_demonstration(shown):
 
 
 def test_bars_of_the_demonstration(shown):
-    checks = [job.result for job in shown[0].jobs[1:]]
+    checks = [job.result for job in shown[0].jobs[1:3]]
     assert [int(check.used.sum()) for check in checks] == [5, 2]
     assert max(check.max_mm for check in checks) < 0.015  # measured 0.0085 mm
+
+
+def test_heights_of_the_demonstration(shown):
+    """Tables 5.1, 5.2 (edge points) and 5.3, 5.4 (centroids), on blocks of the same heights."""
+    edges, centroids = (job for job in shown[0].jobs if job.scene is not None)
+    kept = edges.scene.matches.clean
+    assert kept.sum() > 1000  # measured 1723 of 2865
+    check = edges.result
+    assert check.used.all()
+    assert check.actual_mm.tolist() == [50.44, 44.18, 25.19, 75.07, 25.06]
+    assert check.points_median_mm < 0.04  # measured 0.022 mm
+    assert check.max_mm < 0.06  # measured 0.021 mm; the thesis: 1.6 mm
+    # whole pixels: 0.66 mm in Z each, half of it at worst from either image
+    assert centroids.result.used.all()
+    assert centroids.result.max_mm < 0.7  # measured 0.36 mm; the thesis: 1.1 mm
+    apart = [
+        np.linalg.norm(np.subtract(entry["expected_px"], entry["found_px"]))
+        for entry in centroids.scene.pictures.centroids
+    ]
+    assert len(apart) == 5
+    assert max(apart) < 1.0  # measured 0.53 px; the thesis' Table 5.3: within 1 px
 
 
 def test_the_run_document_repeats_the_report(shown):
@@ -97,12 +120,16 @@ def test_the_report_of_the_demonstration_shows_all_of_it(shown):
     titles = re.findall(r"<h2>\d+\. (.*?)</h2>", html)
     assert titles == [
         *("How it was measured", "Single-point test", "Lengths: bars across"),
-        *("Lengths: bars along", "Predicted error in the volume", "Calibration", "Positions"),
-        *("Image points", "Pictures with detected points", "Versions and inputs", "Glossary"),
+        *("Lengths: bars along", "Heights: blocks", "Heights: centroids"),
+        *("Matches: blocks", "Matches: centroids"),
+        *("Predicted error in the volume", "Calibration", "Positions"),
+        *("Image points", "Pictures with detected points", "Flags", "Versions and inputs"),
+        "Glossary",
     ]
     assert "All 270 readings of job single-point in the order of the table" in html
-    # 14 images of the calibration, two of each camera and job
-    assert html.count("data:image/jpeg") == 14 + 3 * 2 * 2
+    # 14 images of the calibration, two of each camera and job; of the blocks two views in edge
+    # strength, by depth and by flag, of the centroids by depth
+    assert html.count("data:image/jpeg") == 14 + 3 * 2 * 2 + 2 * 3 + 2
     files = len(json.loads((shown[0].folder / "run.json").read_text())["provenance"]["inputs"])
     assert f"Input files: {files} files, combined SHA-256 " in html
 

@@ -38,19 +38,30 @@ class DepthTable:
     ----------
     misfit : ndarray of float32, shape (N, K)
         In px.
-    lowest_mm, step_mm : float
-        Height of the first column, and from column to column.
     axis : int
         World axis along which heights are counted.
+    origin_mm : float
+        Where the first camera stands along it. Columns are even steps of 1 / (height - origin),
+        which is how disparity grows: near and far are sampled alike.
+    lowest, step : float
+        The first column, and from column to column, 1/mm.
     """
 
     misfit: NDArray[np.float32]
-    lowest_mm: float
-    step_mm: float
     axis: int
+    origin_mm: float
+    lowest: float
+    step: float
 
     @classmethod
-    def of(cls, count: int, candidates: Candidates, price: FloatArray, axis: int) -> DepthTable:
+    def of(
+        cls,
+        count: int,
+        candidates: Candidates,
+        price: FloatArray,
+        axis: int,
+        origin_mm: float,
+    ) -> DepthTable:
         """Tabulate the candidates of so many edge points.
 
         Parameters
@@ -63,14 +74,17 @@ class DepthTable:
             Misfit in px of a candidate at its own height.
         axis : int
             World axis along which heights are counted.
+        origin_mm : float
+            Where the first camera stands along it.
         """
-        height = candidates.xyz_mm[:, axis]
+        away = candidates.xyz_mm[:, axis] - origin_mm
+        height, px_per_mm = 1.0 / away, candidates.px_per_mm * away**2  # both of 1 / away
         lowest, highest = float(height.min()), float(height.max())
-        step = 1.0 / float(np.median(candidates.px_per_mm))
+        step = 1.0 / float(np.median(px_per_mm))
         step = max(step, (highest - lowest) / (MOST_LEVELS - 1))
         levels = int((highest - lowest) / step) + 2
         misfit = np.full((count, levels), MISFIT_LIMIT_PX, dtype=np.float32)
-        rate = candidates.px_per_mm * np.maximum(candidates.sine, SHALLOW)  # px per mm
+        rate = px_per_mm * np.maximum(candidates.sine, SHALLOW)
         reach = int(np.ceil(MISFIT_LIMIT_PX / (rate.min() * step)))
         nearest = np.rint((height - lowest) / step).astype(np.int64)
         for offset in range(-reach, reach + 1):
@@ -78,11 +92,12 @@ class DepthTable:
             value = np.abs(lowest + column * step - height) * rate + price
             rows = np.flatnonzero((value < MISFIT_LIMIT_PX) & (column >= 0) & (column < levels))
             _lower(misfit, candidates.point[rows], column[rows], value[rows])
-        return cls(misfit, lowest, step, axis)
+        return cls(misfit, axis, origin_mm, lowest, step)
 
     def column(self, height_mm: FloatArray) -> IntArray:
         """Return the nearest column of heights; -1 outside of the table."""
-        column = np.rint((height_mm - self.lowest_mm) / self.step_mm)
+        with np.errstate(divide="ignore"):
+            column = np.rint((1.0 / (height_mm - self.origin_mm) - self.lowest) / self.step)
         inside = (column >= 0) & (column < self.misfit.shape[1])
         return np.where(inside, column, -1).astype(np.int64)
 

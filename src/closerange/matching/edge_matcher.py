@@ -136,7 +136,7 @@ def _matched(
 ) -> _Side:
     axis = sweep_axis(pencil)
     candidates = find_candidates(pencil, *edges, volume_mm)
-    cost = unary_cost(edges[0], candidates, greys, axis, others)
+    cost = unary_cost(edges[0], candidates, greys, pencil, others)
     choice = choose(edges[0], candidates, cost, axis)
     height = np.full(len(edges[0]), np.nan)
     height[choice.matched] = candidates.xyz_mm[choice.candidate[choice.matched], axis]

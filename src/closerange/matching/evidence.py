@@ -14,9 +14,11 @@ from closerange.features.edge_chains import chain_window
 from closerange.features.edges import EdgePoints
 from closerange.geometry.arrays import BoolArray, FloatArray
 from closerange.geometry.interpolation import bilinear
-from closerange.matching.candidates import Candidates
+from closerange.matching.candidates import Candidates, sweep_axis
 from closerange.matching.depth_table import MISFIT_LIMIT_PX, DepthTable
 from closerange.matching.element_weights import best_rows, support
+from closerange.matching.pencil import Pencil
+from closerange.matching.patches import patch_cost
 from closerange.rig.camera import Camera
 
 TURN_RAD = 0.4
@@ -76,7 +78,7 @@ def unary_cost(
     first: EdgePoints,
     candidates: Candidates,
     greys: tuple[NDArray[Any], NDArray[Any]],
-    axis: int,
+    pencil: Pencil,
     others: Sequence[tuple[Camera, EdgePoints]] = (),
 ) -> FloatArray:
     """Return the cost of each candidate, in pixels of misfit, shape (M,).
@@ -94,8 +96,8 @@ def unary_cost(
         Their crossings in the second view.
     greys : tuple of two ndarrays, shape (H, W)
         Grey values of both images, float32; gain and offset between them may be anything.
-    axis : int
-        The sweep axis.
+    pencil : Pencil
+        Of the two cameras.
     others : sequence of (Camera, EdgePoints), optional
         Further views: a candidate's world point should lie on an edge there too.
 
@@ -106,18 +108,21 @@ def unary_cost(
     """
     if not len(candidates):
         return np.zeros(0)
+    axis = sweep_axis(pencil)
+    origin_mm = float(pencil.first.centre_mm[axis])
     turned = np.clip(turn(first, candidates) / TURN_RAD, 0.0, MISFIT_LIMIT_PX)
-    table = DepthTable.of(len(first), candidates, turned, axis)
+    table = DepthTable.of(len(first), candidates, turned, axis, origin_mm)
     cost = support(first, candidates, table) + TURN_WEIGHT * turned
     upright, slope = _upright(first, candidates)
     if upright.any():
         rows = candidates.select(upright)
-        chain = _chain_misfit(first, rows, slope[upright], axis)
+        chain = _chain_misfit(first, rows, slope[upright], (axis, origin_mm))
         cost[upright] = np.minimum(cost[upright], chain + UPRIGHT_PRICE)
     for camera, edges in others:
         # a reward, not a price: what a further view does not show may be hidden there
         cost += OTHER_WEIGHT * (_other_view(camera, edges, candidates) - HIDDEN_PX)
-    return np.asarray(cost + side_cost(first, candidates, greys, cost))
+    beside = side_cost(first, candidates, greys, cost)
+    return np.asarray(cost + beside + patch_cost(first, candidates, greys))
 
 
 def _other_view(camera: Camera, edges: EdgePoints, candidates: Candidates) -> FloatArray:
@@ -198,15 +203,15 @@ def _upright(first: EdgePoints, candidates: Candidates) -> tuple[BoolArray, Floa
 
 
 def _chain_misfit(
-    first: EdgePoints, upright: Candidates, slope: FloatArray, axis: int
+    first: EdgePoints, upright: Candidates, slope: FloatArray, along: tuple[int, float]
 ) -> FloatArray:
     """Return the mean misfit of a chain that climbs along the sweep axis, shape (M,)."""
-    table = DepthTable.of(len(first), upright, np.zeros(len(upright)), axis)
+    table = DepthTable.of(len(first), upright, np.zeros(len(upright)), *along)
     window = chain_window(first.after, first.before, UPRIGHT_REACH)[upright.point]
     there = window >= 0
     step = first.xy_px[window] - first.xy_px[upright.point][:, None]
     way = np.einsum("nki,ni->nk", step, first.tangent[upright.point])
-    height = upright.xyz_mm[:, axis, None] + slope[:, None] * way
+    height = upright.xyz_mm[:, along[0], None] + slope[:, None] * way
     misfit = np.where(there, table.at(window, height), 0.0)
     return np.asarray(misfit.sum(axis=1) / there.sum(axis=1))
 

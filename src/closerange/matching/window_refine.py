@@ -40,6 +40,12 @@ MOST_PIXELS = 1_000_000
 FINER = np.array([[1, -8, 0, 8, -1]], dtype=np.float32) / 12
 """Derivative exact to the fourth order: a plain difference halves that of fine texture."""
 
+FINER_NOISE = 130 / 144
+"""Variance that white noise of unit variance has after it."""
+
+MOST_NOISE = 0.8
+"""Largest share of the squares of derivatives that is taken for noise."""
+
 GREY_VARIANCE = 1 / 12
 """Least variance of a difference of grey values: they are whole numbers."""
 
@@ -244,8 +250,8 @@ class _Fit:
                 break
         return self._judged()
 
-    def _sampled(self, rows: IntArray) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
-        """Return the second image's values, their change with shifts, and the basic weights."""
+    def _sampled(self, rows: IntArray) -> _Samples:
+        """Sample the second image, and how it changes with shifts along and across the curve."""
         mapping, state = self.mapping.select(rows), self.state
         beside = self.beside[rows]
         place, back, side = mapping.apply(
@@ -263,20 +269,26 @@ class _Fit:
             prefilter=False,
             output=np.float64,
         ).reshape(place.shape[:2])
-        change, change_2 = (
+        changes = [
             self.slopes[0][rows] * step[..., 0] + self.slopes[1][rows] * step[..., 1]
             for step in (back, side)
+        ]
+        good = there & self.inside[rows] & np.isfinite(changes[0])
+        along, across = (np.where(good, change, 0.0) for change in changes)
+        middle = back.shape[1] // 2
+        steps = np.stack([back[:, middle], side[:, middle]], axis=2)
+        return _Samples(
+            values, along, across, np.where(good, self.weight[rows], 0.0), np.nan_to_num(steps)
         )
-        good = there & self.inside[rows] & np.isfinite(change)
-        change, change_2 = np.where(good, change, 0.0), np.where(good, change_2, 0.0)
-        return values, change, change_2, np.where(good, self.weight[rows], 0.0)
 
     def _step(self, rows: IntArray, *, with_gain: bool) -> None:
         state = self.state
         sampled = self._sampled(rows)
         if with_gain:
-            state.gain[rows], state.offset[rows] = _gain(self.grey[rows], sampled[0], sampled[3])
-        system = self._system(rows, *sampled)
+            state.gain[rows], state.offset[rows] = _gain(
+                self.grey[rows], sampled.values, sampled.weight
+            )
+        system = self._system(rows, sampled)
         move = np.linalg.solve(system.normal, system.right[:, :, None])[:, :, 0]
         limit = LONGEST_PX * self.mapping.scale
         shift = np.clip(move[:, 0], -limit, limit)
@@ -292,28 +304,24 @@ class _Fit:
         state.across[rows] += move[:, 5]
         state.last[rows] = np.abs(shift)
 
-    def _system(
-        self,
-        rows: IntArray,
-        values: FloatArray,
-        change: FloatArray,
-        beside: FloatArray,
-        weight: FloatArray,
-    ) -> _System:
-        state = self.state
+    def _system(self, rows: IntArray, sampled: _Samples) -> _System:
+        """Return the normal equations."""
+        state, weight = self.state, sampled.weight
         grey = self.grey[rows]
-        error = values - state.gain[rows, None] * grey - state.offset[rows, None]
+        error = sampled.values - state.gain[rows, None] * grey - state.offset[rows, None]
         spread = _spread(error, weight)
         trust = weight / (1 + (error / (GROSS * spread[:, None])) ** 2) ** 2
         gain = state.gain[rows, None]
-        gained = gain * change
+        gained = gain * sampled.along
         x, y = self.mapping.offset.T * float(self.mapping.scale)
         basis = np.stack(
-            [gained, gained * x, gained * y, -grey, -np.ones_like(grey), gain * beside], axis=2
+            [gained, gained * x, gained * y, -grey, -np.ones_like(grey), gain * sampled.across],
+            axis=2,
         )
         weighted = basis * trust[:, :, None]
         normal = weighted.transpose(0, 2, 1) @ basis
         right = -np.einsum("npk,np->nk", weighted, error)
+        normal -= self._noise_part(normal, trust, spread, gain[:, 0], sampled.steps)
         # tilt and shift beside the curve are known beforehand, though not well
         prior = np.zeros_like(normal)
         prior[:, 1:3, 1:3] = _inverse(self.loose[rows])
@@ -325,12 +333,39 @@ class _Fit:
         normal += 1e-9 * np.eye(6) * np.trace(normal, axis1=1, axis2=2)[:, None, None]
         return _System(normal, right, basis, trust, error, prior, weight, spread)
 
+    def _noise_part(
+        self,
+        normal: FloatArray,
+        trust: FloatArray,
+        spread: FloatArray,
+        gain: FloatArray,
+        steps: FloatArray,
+    ) -> FloatArray:
+        """Return what the noise in the derivatives of the first image adds to the squares.
+
+        It tells nothing about the shift: with it left in, weak texture seems to be strong.
+        """
+        x, y = self.mapping.offset.T * float(self.mapping.scale)
+        place = np.stack([np.ones_like(x), x, y], axis=1)
+        moments = np.einsum("np,pa,pb->nab", trust, place, place)
+        # of the residuals' variance the first image has its part, both being equally noisy
+        variance = FINER_NOISE * spread**2 * gain**2 / (1 + gain**2)
+        products = variance[:, None, None] * steps.transpose(0, 2, 1) @ steps
+        part = np.zeros_like(normal)
+        part[:, :3, :3] = products[:, :1, :1] * moments
+        part[:, 5, 5] = products[:, 1, 1] * moments[:, 0, 0]
+        part[:, 5, :3] = products[:, 0, 1, None] * moments[:, 0]
+        part[:, :3, 5] = part[:, 5, :3]
+        own = [0, 1, 2, 5]
+        share = part[:, own, own] / np.maximum(normal[:, own, own], 1e-12)
+        return np.asarray(part * np.minimum(MOST_NOISE / share.max(axis=1), 1.0)[:, None, None])
+
     def _judged(self) -> Refined:
         state, scale = self.state, self.mapping.scale
         rows = np.arange(len(state.omega))
         sampled = self._sampled(rows)
-        values, weight = sampled[0], sampled[3]
-        system = self._system(rows, *sampled)
+        values, weight = sampled.values, sampled.weight
+        system = self._system(rows, sampled)
         trust, error = system.trust, system.error
         mass = np.maximum(trust.sum(axis=1), 1e-12)
         count = mass**2 / np.maximum((trust**2).sum(axis=1), 1e-12)
@@ -405,6 +440,17 @@ class _Fit:
         height, width = second.shape
         u, v = np.clip(np.nan_to_num(np.rint(place)), 0, [width - 1, height - 1]).astype(int).T
         return np.asarray((state.gain[rows] * here) ** 2 + second[v, u] ** 2)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Samples:
+    """Windows as the second image shows them; `steps` are those of the middle, as columns."""
+
+    values: FloatArray
+    along: FloatArray
+    across: FloatArray
+    weight: FloatArray
+    steps: FloatArray
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -16,7 +16,7 @@ from closerange.errors import CloseRangeWarning, DetectionError, InputError
 from closerange.features.edge_chains import chain_places
 from closerange.features.image_points import ImagePoints
 from closerange.flags import Flag
-from closerange.geometry.arrays import BoolArray, FloatArray, IntArray
+from closerange.geometry.arrays import BoolArray, FloatArray, IntArray, all_finite
 from closerange.images import Frame, check_frame
 from closerange.matching.corner_matcher import match_corners
 from closerange.matching.correspondences import Correspondences
@@ -347,7 +347,7 @@ def _literal(
         if progress:
             progress(done, len(views) - 1)
     places = np.stack(xy, axis=1)
-    known = np.isfinite(places).all(axis=2)
+    known = all_finite(places, 2)
     cov = np.where(known[..., None, None], LITERAL_VARIANCE_PX2 * np.eye(2), np.nan)
     return Correspondences.of(
         cameras=[view.camera.name for view in views],
