@@ -27,6 +27,9 @@ differ by five times their scatter more than 0.85."""
 DEEPEST = 3
 """How often a region is parted: a top from a side, and once more for parts that touch."""
 
+BLUR_PX = 2
+"""Pixels along the border of a region whose grey values are the blur's, not those of a face."""
+
 ON_EDGE_PX = 2.0
 """How far the border of a region may be from the edge that it stands for: half the blur of an edge
 on either side, and a pixel."""
@@ -148,7 +151,7 @@ def _parted(grey: NDArray[Any], regions: list[BoolArray], depth: int = 0) -> lis
     """Part the regions that hold two faces, and keep the brighter parts."""
     kept: list[BoolArray] = []
     for region in regions:
-        values = grey[region]
+        values = _inner(grey, region)
         report = threshold_report(values)
         variance = float(values.astype(np.float64).var())
         share = max(report.between_class_variance, default=0.0) / variance if variance else 0.0
@@ -158,6 +161,13 @@ def _parted(grey: NDArray[Any], regions: list[BoolArray], depth: int = 0) -> lis
         else:
             kept.append(region)
     return kept
+
+
+def _inner(grey: NDArray[Any], region: BoolArray) -> NDArray[Any]:
+    """Return the grey values of a region that its border does not touch; all of a thin one's."""
+    side = 2 * BLUR_PX + 1
+    inner = cv2.erode(region.astype(np.uint8), np.ones((side, side), np.uint8)) > 0
+    return np.asarray(grey[inner if inner.any() else region])
 
 
 def _on_edges(border: FloatArray, edges: EdgePoints, tree: cKDTree) -> FloatArray:

@@ -20,9 +20,9 @@ LARGEST_DAMPING = 1e12
 # The first ends the search; where residuals are large and parameters hang together, each step
 # gains only a little less than the one before, and the second is good enough when steps run out.
 GAIN_LIMIT, GAIN_ENOUGH = 1e-12, 1e-7
-# A step that gains three quarters of what the linear model promised may be longer the next time,
-# one that gains less than a quarter must be shorter (the usual limits, doi:10.1007/BFb0067700).
-KEPT_PROMISE = 0.75
+# A step that gains less than a quarter of what the linear model promised was too long (the usual
+# limit, doi:10.1007/BFb0067700).
+KEPT_PROMISE = 0.25
 # A residual is the difference of two numbers that a few operations have rounded: exact data leave
 # a cost of this share of the numbers' squares, in which no step finds a way down.
 ROUNDING = (4 * np.finfo(np.float64).eps) ** 2
@@ -151,13 +151,11 @@ def levenberg_marquardt(
 
 
 def _next_damping(damping: float, gained: float, promised: float) -> float:
-    """Damping after a step: less where it kept its promise, more where it overshot.
+    """Damping after a step downhill: less where it kept its promise, more where it overshot.
 
     Along a curved valley undamped steps leap from one side to the other and gain next to nothing.
     """
-    if gained >= KEPT_PROMISE * promised:
-        return max(damping / 10, 1e-12)
-    return damping if gained >= (1 - KEPT_PROMISE) * promised else 10 * damping
+    return max(damping / 10, 1e-12) if gained >= KEPT_PROMISE * promised else 10 * damping
 
 
 def _evaluated(function: Residuals, x: FloatArray) -> tuple[FloatArray, FloatArray, float]:

@@ -18,7 +18,6 @@ from closerange.matching.candidates import Candidates, sweep_axis
 from closerange.matching.depth_table import MISFIT_LIMIT_PX, DepthTable
 from closerange.matching.element_weights import best_rows, support
 from closerange.matching.pencil import Pencil
-from closerange.matching.patches import patch_cost
 from closerange.rig.camera import Camera
 
 TURN_RAD = 0.4
@@ -121,8 +120,7 @@ def unary_cost(
     for camera, edges in others:
         # a reward, not a price: what a further view does not show may be hidden there
         cost += OTHER_WEIGHT * (_other_view(camera, edges, candidates) - HIDDEN_PX)
-    beside = side_cost(first, candidates, greys, cost)
-    return np.asarray(cost + beside + patch_cost(first, candidates, greys))
+    return np.asarray(cost + side_cost(first, candidates, greys, cost))
 
 
 def _other_view(camera: Camera, edges: EdgePoints, candidates: Candidates) -> FloatArray:

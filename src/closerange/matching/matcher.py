@@ -7,6 +7,7 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from typing import Any
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
@@ -22,6 +23,7 @@ from closerange.matching.edge_matcher import EdgeMatches, match_edges, on_rays
 from closerange.matching.pencil import Pencil
 from closerange.matching.sight import checked_volume, inside_image
 from closerange.matching.volume_proposal import check_in_view
+from closerange.matching.window_matcher import WindowMatches, match_windows
 from closerange.rig.camera import Camera
 
 ON_EDGE_PX = 1.0
@@ -29,6 +31,17 @@ ON_EDGE_PX = 1.0
 
 ACROSS_PX = 0.02
 """Least standard deviation across the epipolar curve: a match lies on the curve by construction."""
+
+TEXTURE_WINDOW_PX = 31
+"""Side of the square in which edge points are counted."""
+
+TEXTURE_LINES = 5.0
+"""So many straight edges through that square are texture, if they go several ways: a corner of a
+part has three."""
+
+TEXTURE_ONE_WAY = 0.6
+"""Length of the mean of the doubled directions, from 0 (all ways) to 1 (parallel), above which
+edges are taken for parallel."""
 
 OWN_SHARE = 0.3
 """Least share of a match's uncertainty that stays with it when the seed's own is taken out."""
@@ -91,8 +104,6 @@ def strong_edges(pixels: NDArray[Any], edges: EdgePoints) -> BoolArray:
     ndarray of bool, shape (N,)
         The thesis' edge points, to a fraction of a pixel (section 5.3).
     """
-    import cv2  # noqa: PLC0415  # two lines that need it
-
     mask, _ = edge_mask(pixels)
     near = cv2.dilate(mask.astype(np.uint8), np.ones((3, 3), np.uint8))
     column, row = np.rint(edges.xy_px).astype(np.int64).T
@@ -206,32 +217,104 @@ def _pair(
     seeds: FloatArray,
     seed_cov: FloatArray,
 ) -> _Found:
+    """Match by edges what lies on an edge of a plain part, by windows all else."""
     pencil = Pencil.of(first.camera, second.camera)
-    if not len(first.edges):
-        return _nothing(len(seeds))
     greys = (first.pixels.astype(np.float32), second.pixels.astype(np.float32))
-    others = [(view.camera, view.edges) for view in rest]
-    matches = match_edges(pencil, (first.edges, second.edges), greys, volume_mm, others)
-    near, edge = _nearest(first.edges, seeds)
+    edges = (plain_edges(first.edges), plain_edges(second.edges))
+    near, edge = _nearest(edges[0], seeds)
+    found = _nothing(len(seeds))
+    if near.any():
+        others = [(view.camera, plain_edges(view.edges)) for view in rest]
+        matches = match_edges(pencil, edges, greys, volume_mm, others)
+        rows = np.flatnonzero(near)
+        _put(found, rows, _by_edges(pencil, matches, edge[rows], seeds[rows], seed_cov[rows]))
+    rows = np.flatnonzero(~near & all_finite(seeds, 1) & inside_image(first.camera, seeds))
+    if rows.size:
+        windows = match_windows(pencil, greys, edges, seeds[rows], volume_mm)
+        _put(found, rows, _by_windows(windows))
+    outside = all_finite(found.xy_px, 1) & ~inside_image(second.camera, found.xy_px)
+    found.flags[outside] |= int(Flag.outside_image)
+    return found
+
+
+def _put(found: _Found, rows: IntArray, part: _Found) -> None:
+    for name in ("xy_px", "cov_px2", "mismatch", "flags"):
+        getattr(found, name)[rows] = getattr(part, name)
+
+
+def _by_edges(
+    pencil: Pencil,
+    matches: EdgeMatches,
+    edge: IntArray,
+    seeds: FloatArray,
+    seed_cov: FloatArray,
+) -> _Found:
     axis = sweep_axis(pencil)
-    height = np.where(near, matches.xyz_mm[edge, axis], np.nan)
-    xyz_mm = on_rays(pencil, seeds, height, axis)
-    xy_px = second.camera.project(xyz_mm)
-    flags = np.where(near, matches.flags[edge], int(Flag.no_edge))
-    found = all_finite(xy_px, 1)
-    outside = found & ~inside_image(second.camera, xy_px)
-    flags[outside] |= int(Flag.outside_image)
-    flags[~found & (flags == 0)] |= int(Flag.occluded)
+    xyz_mm = on_rays(pencil, seeds, matches.xyz_mm[edge, axis], axis)
+    xy_px = pencil.second.project(xyz_mm)
+    flags = matches.flags[edge]
+    lost = ~all_finite(xy_px, 1)
+    flags[lost & (flags == 0)] |= int(Flag.occluded)
     cov = _match_cov(matches, edge, seed_cov)
-    cov[~found] = np.nan
-    return _Found(xy_px, cov, np.where(near, matches.cost[edge], np.nan), flags)
+    cov[lost] = np.nan
+    return _Found(xy_px, cov, matches.cost[edge], flags)
+
+
+def _by_windows(matches: WindowMatches) -> _Found:
+    lost = ~all_finite(matches.xy_px, 1)
+    flags = np.array(matches.flags)
+    flags[lost & (flags == 0)] |= int(Flag.not_found)
+    way = matches.epipolar
+    outer = way[:, :, None] * way[:, None, :]
+    across = np.full(len(way), ACROSS_PX**2)
+    cov = matches.std_px[:, None, None] ** 2 * outer + across[:, None, None] * (np.eye(2) - outer)
+    cov[lost] = np.nan
+    return _Found(np.array(matches.xy_px), cov, np.array(matches.cost), flags)
+
+
+def plain_edges(edges: EdgePoints) -> EdgePoints:
+    """Leave out the edge points of textured surfaces.
+
+    Texture is where many edges of many directions lie close together: there every candidate finds
+    some edge near it, while a window of grey values is unlike any other. Coils, teeth and
+    other parallel edges have one direction and stay.
+
+    Parameters
+    ----------
+    edges : EdgePoints
+        N points.
+
+    Returns
+    -------
+    EdgePoints
+        Those of plain parts.
+    """
+    if not len(edges):
+        return edges
+    width, height = edges.size_px
+    column, row = np.rint(edges.xy_px).astype(np.int64).T
+    twice = 2 * np.arctan2(edges.normal[:, 1], edges.normal[:, 0])
+    sums = []
+    for value in (np.ones(len(edges)), np.cos(twice), np.sin(twice)):
+        image = np.zeros((height, width), dtype=np.float32)
+        np.add.at(image, (row, column), value.astype(np.float32))
+        window = (TEXTURE_WINDOW_PX, TEXTURE_WINDOW_PX)
+        summed = cv2.boxFilter(image, -1, window, normalize=False, borderType=cv2.BORDER_CONSTANT)
+        sums.append(summed[row, column])
+    many = sums[0] > TEXTURE_LINES * TEXTURE_WINDOW_PX
+    one_way = np.hypot(sums[1], sums[2]) > TEXTURE_ONE_WAY * sums[0]
+    textured = many & ~one_way
+    return edges.select(~textured) if textured.any() else edges
 
 
 def _nothing(count: int) -> _Found:
-    """Return that none of the seeds lies on an edge."""
-    nan = np.full((count, 2, 2), np.nan)
-    flags = np.full(count, int(Flag.no_edge), dtype=np.int64)
-    return _Found(nan[:, 0], nan, nan[:, 0, 0], flags)
+    """Return that nothing was found, to be filled in."""
+    return _Found(
+        np.full((count, 2), np.nan),
+        np.full((count, 2, 2), np.nan),
+        np.full(count, np.nan),
+        np.full(count, int(Flag.no_edge), dtype=np.int64),
+    )
 
 
 def _nearest(edges: EdgePoints, seeds: FloatArray) -> tuple[BoolArray, IntArray]:
