@@ -321,6 +321,13 @@ def test_item_43_calibration_of_other_cameras_is_noticed(tables, run, tmp_path):
     assert "error: the rays of 63 of 63 points miss each other" in outcome.stderr
     rows = (tmp_path / "positions.csv").read_text(encoding="utf-8").splitlines()[1:]
     assert all("residual" in row.rsplit(",", 1)[1] for row in rows)
+    result = tmp_path / "result.json"
+    told = run(
+        "verify", "control", tmp_path / "positions.csv", "--truth", tables.control, "-o", result
+    )
+    assert told.code == 1
+    assert "63 of 63 rows with a true position could not be used" in told.stderr
+    assert result.is_file()
 
 
 def test_item_44_bumped_camera_is_noticed(tables, run, tmp_path):

@@ -188,7 +188,7 @@ def test_the_limit_of_roll_leaves_what_the_centres_leave_open(scale):
     turned = np.rot90(np.arange(9).reshape(3, 3), -1).ravel()  # upright is now another edge
     index = label_discs(*flat(PLAIN, 45.1 + uncertain, scale), PLAIN)
     assert index.tolist() == turned.tolist()
-    with pytest.raises(DetectionError, match="read up to 4[0-4]"):
+    with pytest.raises(DetectionError, match=r"read up to 4[0-4]"):
         label_discs(*flat(PLAIN, 45.1 - uncertain, scale), PLAIN)
 
 

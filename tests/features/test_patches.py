@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from itertools import pairwise
+
 import cv2
 import numpy as np
 import pytest
@@ -10,11 +12,15 @@ from closerange.features.patches import area_centroid, find_patches
 
 
 def drawn(shapes, *, size=(240, 200), noise=1.0, ground=30):
-    """Draw polygons in given greys, 8 x 8 times finer, blurred, with noise."""
+    """Draw convex polygons in given greys, 8 x 8 times finer, blurred, with noise."""
     fine = np.full((size[1] * 8, size[0] * 8), ground, np.uint8)
+    # pixel (0, 0) is a centre: its corner lies at (-0.5, -0.5)
+    x, y = (np.arange(8 * side) / 8 + 1 / 16 - 0.5 for side in size)
     for corners, grey in shapes:
-        # pixel (0, 0) is a centre: its corner lies at (-0.5, -0.5)
-        cv2.fillPoly(fine, [np.rint((np.array(corners) + 0.5) * 8 - 0.5).astype(np.int32)], grey)
+        inside = np.ones(fine.shape, bool)
+        for (ax, ay), (bx, by) in pairwise([*corners, corners[0]]):
+            inside &= (bx - ax) * (y[:, None] - ay) - (by - ay) * (x - ax) >= 0
+        fine[inside] = grey
     grey = cv2.resize(fine, size, interpolation=cv2.INTER_AREA).astype(np.float64)
     grey = cv2.GaussianBlur(grey, (0, 0), 0.7) + np.random.default_rng(2).normal(
         0, noise, grey.shape
@@ -80,3 +86,11 @@ def test_what_touches_the_border_is_no_whole_face():
 def test_noise_has_no_faces():
     image = np.clip(np.random.default_rng(4).normal(60, 10, (150, 150)), 0, 255).astype(np.uint8)
     assert len(find_patches(image)) == 0
+
+
+def test_a_strip_of_a_brighter_side_is_cut_off():
+    """One corner of the side is brighter than the image's threshold, the rest is not."""
+    image = drawn([(SIDE, 60), ([(25.0, 100.0), (45.0, 106.0), (45.0, 112.0), (25.0, 106.0)], 115),
+                   (TOP, 190)])  # fmt: skip
+    found = find_patches(image)
+    np.testing.assert_allclose(found.xy_px[0], area_centroid(np.array(TOP))[1], atol=0.1)

@@ -62,7 +62,7 @@ class ControlPoints:
         for row in np.flatnonzero(~np.isfinite(self.xyz_mm).all(axis=1)):
             x, y, z = self.xyz_mm[row]
             raise InputError(
-                f"control {self._name(int(row))}: its position ({x:g}, {y:g}, {z:g}) mm is not known",
+                f"control {self._name(int(row))}: its position ({x:g}, {y:g}, {z:g}) mm is unknown",
                 remedy="leave the point out, or give three finite numbers",
             )
         for row in np.flatnonzero(~((self.std_mm >= 0) & np.isfinite(self.std_mm))):

@@ -117,7 +117,7 @@ def chain_window(after: IntArray, before: IntArray, reach: int) -> IntArray:
 
 def _neighbours(xy_px: FloatArray, size_px: tuple[int, int]) -> tuple[IntArray, IntArray]:
     """Return all pairs of points whose pixels are at most `REACH_PX` apart in row and column."""
-    width, height = size_px
+    width = size_px[0]
     pixel = np.rint(xy_px).astype(np.int64) + REACH_PX + 1
     stride = width + 2 * (REACH_PX + 1)
     place = pixel[:, 1] * stride + pixel[:, 0]

@@ -113,7 +113,7 @@ def find_edges(
 ) -> EdgePoints:
     """Find edge points to a fraction of a pixel.
 
-    The maxima of the Gaussian-smoothed gradient along its direction (doi:10.1109/TPAMI.1986.4767851),
+    The maxima of the smoothed gradient along its direction (doi:10.1109/TPAMI.1986.4767851),
     placed by a parabola through three bicubic samples of the gradient's magnitude: bilinear samples
     would bias it by 0.06 px with the point's place in the pixel grid, these by 0.01 px.
 

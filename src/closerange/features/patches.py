@@ -30,6 +30,10 @@ DEEPEST = 3
 BLUR_PX = 2
 """Pixels along the border of a region whose grey values are the blur's, not those of a face."""
 
+WHOLE = 0.85
+"""Share of a region that must be brighter than half-way from its threshold to its own grey for it
+to be tightened: what is lost then is a strip that belongs to a neighbour, not a part in shadow."""
+
 ON_EDGE_PX = 2.0
 """How far the border of a region may be from the edge that it stands for: half the blur of an edge
 on either side, and a pixel."""
@@ -91,7 +95,8 @@ def find_patches(pixels: NDArray[Any], edges: EdgePoints | None = None) -> Patch
     edges = find_edges(grey) if edges is None else edges
     tree = cKDTree(edges.xy_px) if len(edges) else None
     found = []
-    for region in _parted(grey, _regions(grey > threshold_report(grey).threshold)):
+    level = threshold_report(grey).threshold
+    for region in _parted(grey, _regions(grey > level), level):
         border: FloatArray = max(follow_borders(region), key=len).astype(np.float64)
         if tree is not None:
             border = _on_edges(border, edges, tree)
@@ -147,8 +152,13 @@ def _regions(mask: BoolArray) -> list[BoolArray]:
     return kept
 
 
-def _parted(grey: NDArray[Any], regions: list[BoolArray], depth: int = 0) -> list[BoolArray]:
-    """Part the regions that hold two faces, and keep the brighter parts."""
+def _parted(
+    grey: NDArray[Any], regions: list[BoolArray], level: float, depth: int = 0
+) -> list[BoolArray]:
+    """Part the regions that hold two faces, keep the brighter parts and tighten them.
+
+    The regions are those above `level`.
+    """
     kept: list[BoolArray] = []
     for region in regions:
         values = _inner(grey, region)
@@ -157,10 +167,18 @@ def _parted(grey: NDArray[Any], regions: list[BoolArray], depth: int = 0) -> lis
         share = max(report.between_class_variance, default=0.0) / variance if variance else 0.0
         brighter = _regions(region & (grey > report.threshold)) if share >= TWO_FACES else []
         if brighter and depth < DEEPEST:
-            kept += _parted(grey, brighter, depth + 1)
+            kept += _parted(grey, brighter, report.threshold, depth + 1)
         else:
-            kept.append(region)
+            kept.append(_tightened(grey, region, (float(np.median(values)) + level) / 2))
     return kept
+
+
+def _tightened(grey: NDArray[Any], region: BoolArray, level: float) -> BoolArray:
+    """Return the part of a region above a level, if that is nearly all of it."""
+    parts = _regions(region & (grey > level))
+    largest = max(parts, key=np.count_nonzero, default=region)
+    whole = np.count_nonzero(largest) >= WHOLE * np.count_nonzero(region)
+    return largest if whole else region
 
 
 def _inner(grey: NDArray[Any], region: BoolArray) -> NDArray[Any]:

@@ -82,7 +82,9 @@ def fit_chains(edges: EdgePoints, value_px: FloatArray, std_px: FloatArray) -> C
     trust = np.ones(len(value))
     smooth = target
     for _ in range(ROUNDS if known.any() else 0):
-        smooth = solveh_banded(_matrix(weight * trust, joined, bends), weight * trust * target, lower=True)
+        smooth = solveh_banded(
+            _matrix(weight * trust, joined, bends), weight * trust * target, lower=True
+        )
         residual = (target - smooth) * np.sqrt(weight)
         trust = 1.0 / (1.0 + (residual / GROSS) ** 2) ** 2
     reached = np.bincount(name, known, minlength=1)[name] > 0
@@ -109,7 +111,7 @@ def _bends(joined: BoolArray, normal: FloatArray) -> IntArray:
     """Return the rows in the middle of three that form one smooth piece."""
     middle = np.flatnonzero(joined[1:-1] & joined[2:]) + 1
     turn = np.einsum("ni,ni->n", normal[middle - 1], normal[middle + 1])
-    return middle[turn > CORNER]
+    return np.asarray(middle[turn > CORNER])
 
 
 def _matrix(weight: FloatArray, joined: BoolArray, bends: IntArray) -> FloatArray:

@@ -5,10 +5,11 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from closerange.features.edge_chains import chain_places
 from closerange.features.edges import EdgePoints
-from closerange.geometry.arrays import FloatArray, IntArray
+from closerange.geometry.arrays import BoolArray, FloatArray, IntArray
 from closerange.matching.candidates import Candidates
 
 MOST_CANDIDATES = 12
@@ -21,7 +22,7 @@ STEP_LIMIT = 3.0
 """Cost of any larger step: two edges may look like one chain."""
 
 NEIGHBOUR_PRICE = 0.1
-"""Cost of any step between neighbours that are neighbours in the other view too: the edge climbs."""
+"""Cost of any step between neighbours that are neighbours in the other view: the edge climbs."""
 
 NEIGHBOUR_PLACES = 4.0
 """Places on a chain of the other view that still are neighbours: an edge may be seen there up to
@@ -65,7 +66,7 @@ class Choice:
     """
 
     candidate: IntArray
-    matched: np.ndarray[tuple[int], np.dtype[np.bool_]]
+    matched: BoolArray
     margin: FloatArray
     cost: FloatArray
     lead: FloatArray
@@ -116,10 +117,10 @@ def choose(first: EdgePoints, candidates: Candidates, cost: FloatArray, axis: in
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Grid:
-    """Candidates as a table of N points by K, best first; the last column of `unary` is no match."""
+    """Candidates as a table, N by K, best first; the last column of `unary` is no match."""
 
     row: IntArray
-    unary: np.ndarray[tuple[int, int], np.dtype[np.float32]]
+    unary: NDArray[np.float32]
     height: FloatArray
     px_per_mm: FloatArray
     chain: IntArray
@@ -153,13 +154,15 @@ class _Grid:
             place=table(candidates.place, np.nan),
         )
 
-    def steps(self, point: IntArray, after: IntArray) -> np.ndarray[tuple[int, int, int], np.dtype[np.float32]]:
+    def steps(self, point: IntArray, after: IntArray) -> NDArray[np.float32]:
         """Return what neighbours pay for each pair of candidates, shape (L, K + 1, K + 1)."""
         apart = np.abs(self.height[point][:, :, None] - self.height[after][:, None, :])
         price = np.minimum(STEP_PRICE * apart * self.px_per_mm[point][:, :, None], STEP_LIMIT)
         same = self.chain[point][:, :, None] == self.chain[after][:, None, :]
         near = np.abs(self.place[point][:, :, None] - self.place[after][:, None, :])
-        price = np.where(same & (near <= NEIGHBOUR_PLACES), np.minimum(price, NEIGHBOUR_PRICE), price)
+        price = np.where(
+            same & (near <= NEIGHBOUR_PLACES), np.minimum(price, NEIGHBOUR_PRICE), price
+        )
         width = self.unary.shape[1]
         full = np.full((len(point), width, width), CHANGE, dtype=np.float32)
         full[:, :-1, :-1] = np.where(np.isnan(price), NEVER, price)
@@ -167,7 +170,7 @@ class _Grid:
         return full
 
 
-def _messages(first: EdgePoints, grid: _Grid) -> np.ndarray[tuple[int, int], np.dtype[np.float32]]:
+def _messages(first: EdgePoints, grid: _Grid) -> NDArray[np.float32]:
     """Return what every point hears from both sides of its chain, shape (N, K + 1)."""
     link = np.flatnonzero(first.after >= 0)
     price = np.empty((len(link), *[grid.unary.shape[1]] * 2), dtype=np.float32)
@@ -195,17 +198,19 @@ def _layout(first: EdgePoints) -> IntArray:
         rows = whole[length > start, max(start - WARM_UP, 0) : start + PIECE + WARM_UP]
         if start < WARM_UP:
             rows = np.pad(rows, ((0, 0), (WARM_UP - start, 0)), constant_values=-1)
-        pieces.append(np.pad(rows, ((0, 0), (0, PIECE + 2 * WARM_UP - rows.shape[1])), constant_values=-1))
+        pieces.append(
+            np.pad(rows, ((0, 0), (0, PIECE + 2 * WARM_UP - rows.shape[1])), constant_values=-1)
+        )
     return np.concatenate(pieces) if pieces else np.zeros((0, PIECE), dtype=np.int64)
 
 
 def _walk(
     layout: IntArray,
     number: IntArray,
-    price: np.ndarray[tuple[int, int, int], np.dtype[np.float32]],
+    price: NDArray[np.float32],
     grid: _Grid,
-    heard: np.ndarray[tuple[int, int], np.dtype[np.float32]],
-    backwards: bool,  # noqa: FBT001
+    heard: NDArray[np.float32],
+    backwards: bool,
 ) -> None:
     """Send messages along every row of the layout; add those of its middle part to `heard`."""
     message = np.zeros((len(layout), grid.unary.shape[1]), dtype=np.float32)

@@ -106,7 +106,9 @@ class DepthTable:
         column = self.column(height_mm)
         return np.where(column >= 0, self.misfit[point, column], MISFIT_LIMIT_PX)
 
-    def support(self, xy_px: FloatArray, candidates: Candidates, half_width_px: float) -> FloatArray:
+    def support(
+        self, xy_px: FloatArray, candidates: Candidates, half_width_px: float
+    ) -> FloatArray:
         """Return the mean misfit within a square structuring element, shape (M,).
 
         Parameters
@@ -139,9 +141,7 @@ class DepthTable:
         return np.asarray(flat[here, column] / flat[here, -1], dtype=np.float64)
 
 
-def _lower(
-    table: NDArray[np.float32], row: IntArray, column: IntArray, value: FloatArray
-) -> None:
+def _lower(table: NDArray[np.float32], row: IntArray, column: IntArray, value: FloatArray) -> None:
     """Put the least of the values that fall into each entry."""
     np.minimum.at(table, (row, column), value.astype(np.float32))
 

@@ -11,8 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from closerange.features.edge_chains import chain_window
-from closerange.features.edges import EdgePoints
 from closerange.features.edge_uncertainty import chain_mean
+from closerange.features.edges import EdgePoints
 from closerange.flags import Flag
 from closerange.geometry.arrays import BoolArray, FloatArray, IntArray
 from closerange.matching.candidates import SHALLOWEST, Candidates, find_candidates, sweep_axis
@@ -119,9 +119,7 @@ def match_edges(
     """
     with ThreadPoolExecutor(2) as pool:
         there = pool.submit(_matched, pencil, edges, greys, volume_mm, others)
-        back = pool.submit(
-            _matched, pencil.reversed(), edges[::-1], greys[::-1], volume_mm, others
-        )
+        back = pool.submit(_matched, pencil.reversed(), edges[::-1], greys[::-1], volume_mm, others)
         forward, backward = there.result(), back.result()
     smooth = _smoothed(pencil, edges, forward, sweep_axis(pencil))
     return _judged(pencil, edges, (forward, backward), smooth, volume_mm)
@@ -167,11 +165,13 @@ def _smoothed(
     pace, sine_first = _in_first_view(pencil, edges[0].tangent[rows], chosen, axis)
     along_first = pace / sine_first
     merged = _merged(edges, rows, chosen)
-    noise = [edges[0].noise_px[rows], _between(edges[1].noise_px, chosen, edges[1])]
-    model = [edges[0].model_px[rows], _between(edges[1].model_px, chosen, edges[1])]
-    noise, model = (
-        np.hypot(part[0] * along_first, part[1] / chosen.sine)
-        for part in (noise, [np.hypot(a, b) for a, b in zip(model, merged, strict=True)])
+    noise = np.hypot(
+        edges[0].noise_px[rows] * along_first,
+        _between(edges[1].noise_px, chosen, edges[1]) / chosen.sine,
+    )
+    model = np.hypot(
+        np.hypot(edges[0].model_px[rows], merged[0]) * along_first,
+        np.hypot(_between(edges[1].model_px, chosen, edges[1]), merged[1]) / chosen.sine,
     )
     std, value, sine = (np.full(count, np.nan) for _ in range(3))
     # a point without a candidate stands between its neighbours, with the usual share of theirs
@@ -220,8 +220,10 @@ def _between(value: FloatArray, chosen: Candidates, second: EdgePoints) -> Float
 def _in_first_view(
     pencil: Pencil, tangent: FloatArray, chosen: Candidates, axis: int
 ) -> tuple[FloatArray, FloatArray]:
-    """Return px in the second view per px in the first, along the epipolar curves of both; and
-    the sine between edge and curve in the first."""
+    """Return px in the second view per px in the first, along the epipolar curves of both.
+
+    And the sine of the angle between edge and curve in the first view.
+    """
     ray = chosen.xyz_mm - pencil.second.centre_mm
     jacobian = pencil.first.project_jacobian(chosen.xyz_mm)
     moved = np.einsum("nij,nj->ni", jacobian, ray / ray[:, axis, None])

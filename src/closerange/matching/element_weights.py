@@ -98,7 +98,7 @@ def _margin(cost: FloatArray, candidates: Candidates, axis: int) -> FloatArray:
     elsewhere = np.abs(apart) * candidates.px_per_mm > ELSEWHERE_PX
     margin = np.full(len(best), MISFIT_LIMIT_PX)
     np.minimum.at(margin, place[elsewhere], (cost - cost[best][place])[elsewhere])
-    return margin[place]
+    return np.asarray(margin[place])
 
 
 def best_rows(cost: FloatArray, point: IntArray) -> IntArray:

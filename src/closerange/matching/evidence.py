@@ -41,7 +41,7 @@ SIDE_TOLERANCE = 0.3
 a matt surface changes its brightness by less between views 30 degrees apart."""
 
 FAR_WEIGHT = 0.25
-"""Weight of the less similar side: behind an edge the views see different things, but not always."""
+"""Weight of the less similar side: behind an edge the views mostly see different things."""
 
 SIDE_LIMIT = 2.0
 """More than so many units say no more: a highlight differs without limit."""
@@ -218,5 +218,3 @@ def _cosine(a: FloatArray, b: FloatArray) -> FloatArray:
     length = np.linalg.norm(a, axis=1) * np.linalg.norm(b, axis=1)
     with np.errstate(divide="ignore", invalid="ignore"):
         return np.asarray(np.einsum("ni,ni->n", a, b) / length)
-
-

@@ -17,8 +17,8 @@ from closerange.features.edge_operators import edge_mask
 from closerange.features.edges import EdgePoints, find_edges
 from closerange.flags import Flag
 from closerange.geometry.arrays import BoolArray, FloatArray, IntArray, all_finite
-from closerange.matching.correspondences import Correspondences
 from closerange.matching.candidates import sweep_axis
+from closerange.matching.correspondences import Correspondences
 from closerange.matching.edge_matcher import EdgeMatches, match_edges, on_rays
 from closerange.matching.pencil import Pencil
 from closerange.matching.sight import checked_volume, inside_image
@@ -118,7 +118,7 @@ def views_of(cameras: Sequence[Camera], images: Sequence[NDArray[Any]]) -> list[
     InputError
         If there are fewer than two, or a size is wrong.
     """
-    if len(cameras) < 2:  # noqa: PLR2004
+    if len(cameras) < 2:
         raise InputError(
             f"{len(cameras)} image; a match needs two views of different cameras",
             remedy="give one image of each camera: NAME=IMAGE NAME=IMAGE",

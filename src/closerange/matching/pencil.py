@@ -1,4 +1,4 @@
-"""The pencil of epipolar planes of two cameras: coordinates in which correspondence is one number."""
+"""The pencil of epipolar planes of two cameras: coordinates that make a match one number."""
 
 from __future__ import annotations
 

@@ -76,7 +76,9 @@ def start_level(samples: int, hypotheses: int, size_px: tuple[int, int]) -> int:
         Of the smaller image.
     """
     level = 1
-    while level < COARSEST and samples * hypotheses > WINDOWS << level and min(size_px) >= 64 << level:
+    while (
+        level < COARSEST and samples * hypotheses > WINDOWS << level and min(size_px) >= 64 << level
+    ):
         level += 1
     return level
 

@@ -62,8 +62,10 @@ class Information:
             S half-widths of windows with Gaussian weights, px.
         """
         noise = noise_map(grey)
-        slope = [cv2.Sobel(grey, cv2.CV_32F, *order, ksize=3, scale=1 / 8) / noise
-                 for order in ((1, 0), (0, 1))]
+        slope = [
+            cv2.Sobel(grey, cv2.CV_32F, *order, ksize=3, scale=1 / 8) / noise
+            for order in ((1, 0), (0, 1))
+        ]
         # of white noise with unit variance, Sobel's derivative keeps 12 / 64
         own = 12 / 64
         products = (slope[0] ** 2 - own, slope[0] * slope[1], slope[1] ** 2 - own)
@@ -140,7 +142,9 @@ def saturation(grey: NDArray[np.float32]) -> float:
     return largest if largest in scales else np.inf
 
 
-def clipped_share(grey: NDArray[np.float32], xy_px: FloatArray, half_width: FloatArray) -> FloatArray:
+def clipped_share(
+    grey: NDArray[np.float32], xy_px: FloatArray, half_width: FloatArray
+) -> FloatArray:
     """Return the share of pixels at full scale in the square around each point, shape (N,)."""
     full = grey >= saturation(grey)
     if not full.any():

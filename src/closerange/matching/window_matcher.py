@@ -262,7 +262,11 @@ class _Job:
         evidence, best = _better(rays, places, best, rival)
         best = _held(rays, places, best)
         found = _Found(
-            best.omega, best.std_px, best.across_px, best.misfit_px, size.astype(float),
+            best.omega,
+            best.std_px,
+            best.across_px,
+            best.misfit_px,
+            size.astype(float),
             np.zeros(len(rays), dtype=np.int64),
         )
         seen = _seen(rays, best.omega)
@@ -404,9 +408,7 @@ def _held(rays: SeedRays, places: Places, refined: Refined) -> Refined:
     return Refined(**values)
 
 
-def _segments(
-    pencil: Pencil, rays: SeedRays, volume_mm: FloatArray
-) -> tuple[FloatArray, IntArray]:
+def _segments(pencil: Pencil, rays: SeedRays, volume_mm: FloatArray) -> tuple[FloatArray, IntArray]:
     """Return inverse depths a px apart along the segments, shape (N, K), and flags."""
     segments = epipolar_segment(pencil.first, pencil.second, rays.xy_px, volume_mm)
     length = np.linalg.norm(rays.ray, axis=1)[:, None]

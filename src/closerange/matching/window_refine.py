@@ -21,6 +21,9 @@ ROUNDS = 10
 LONGEST_PX = 0.8
 """Longest step, px of the level: the grey values are linear no further."""
 
+SETTLED_PX = 0.1
+"""A step below it shows that the match is near."""
+
 STILL_PX = 0.004
 """A step below it ends the iteration: a fifth of what interpolation leaves."""
 
@@ -321,7 +324,10 @@ class _Fit:
         weighted = basis * trust[:, :, None]
         normal = weighted.transpose(0, 2, 1) @ basis
         right = -np.einsum("npk,np->nk", weighted, error)
-        normal -= self._noise_part(normal, trust, spread, gain[:, 0], sampled.steps)
+        # far from the match the residuals are no noise
+        settled = state.last[rows] < SETTLED_PX * self.mapping.scale
+        noise = self._noise_part(normal, trust, spread, gain[:, 0], sampled.steps)
+        normal -= noise * settled[:, None, None]
         # tilt and shift beside the curve are known beforehand, though not well
         prior = np.zeros_like(normal)
         prior[:, 1:3, 1:3] = _inverse(self.loose[rows])
