@@ -13,7 +13,6 @@ from closerange.images import (
     list_images,
     noise_level,
     read_image,
-    saturated_share,
     structure_range,
 )
 
@@ -117,15 +116,6 @@ def test_an_empty_table_is_uniform_and_one_block_is_not(shared):
     with pytest.raises(DetectionError, match="uniform"):
         check_frame(read_image(folder / "left_f5.png"))
     assert check_frame(read_image(folder / "left_f4.png")) == []
-
-
-def test_saturation_is_counted_at_full_scale():
-    pixels = np.zeros((10, 10), np.uint16)
-    pixels[:3] = 4095
-    pixels[0, 0] = 65535
-    frame = Frame("left", pixels)
-    assert saturated_share(frame) == 0.01
-    assert saturated_share(frame, full_scale=4095) == 0.3
 
 
 def test_tiny_frames_are_judged_too():

@@ -11,7 +11,6 @@ from closerange.errors import InputError
 from closerange.images import (
     Frame,
     check_duplicates,
-    check_sizes,
     group_images,
     placement_and_reading,
     placement_name,
@@ -138,11 +137,3 @@ def test_identical_pixels_are_refused_within_and_across_cameras():
     check_duplicates([one, Frame("right", changed, None, "5.png")])
     # the same bytes in another shape or depth are another image
     check_duplicates([one, Frame("left", one.pixels.reshape(6, 8)), frame(dtype=np.uint16)])
-
-
-def test_sizes_and_depths_must_agree_within_a_camera():
-    check_sizes([frame(), frame(), frame("right", shape=(9, 9))])
-    with pytest.raises(InputError, match=r"'left': b.png has 6 x 9 pixels .* a.png has 6 x 8"):
-        check_sizes([frame(), frame(source="b.png", shape=(9, 6))])
-    with pytest.raises(InputError, match=r"\(uint16\).*\(uint8\)"):
-        check_sizes([frame(), frame(dtype=np.uint16)])

@@ -11,7 +11,7 @@ from scipy.optimize import least_squares
 
 from closerange.position.triangulate import refine, solve_points, triangulate_linear
 from closerange.rig.distortion import BrownIdeal, BrownObserved
-from closerange.verification.bound import BROWN, parameter_bound
+from closerange.verification.bound import BROWN
 from closerange.verification.scenes import SyntheticRig, control_grid, looking_at_origin
 
 LENSES = {
@@ -121,7 +121,8 @@ def uncertain_rig(count=2):
     cov = np.zeros((count * size, count * size))
     for i, camera in enumerate(rig.cameras):
         block = slice(i * size, (i + 1) * size)
-        cov[block, block] = parameter_bound(camera, BROWN, control, rig.noise_px)
+        rows = camera.parameter_jacobian(control, BROWN).reshape(-1, size)
+        cov[block, block] = rig.noise_px**2 * np.linalg.inv(rows.T @ rows)
     names = [f"{camera.name}.{name}" for camera in rig.cameras for name in BROWN]
     return replace(rig, parameters=tuple(names), parameter_cov=cov)
 

@@ -15,9 +15,7 @@ from closerange.rig.decompose import camera_from_matrix
 from closerange.rig.distortion import BrownIdeal, BrownObserved
 from closerange.rig.dlt import solve_dlt
 from closerange.rig.radial_table import (
-    RadialPolynomial,
     RadialTable,
-    fit_radial_polynomial,
     lens_centre,
     radial_table_of,
 )
@@ -237,28 +235,6 @@ def replace_tangential(lens: BrownObserved) -> BrownObserved:
     return BrownObserved(lens.k1, lens.k2, lens.k3, centre_px=lens.centre_px)
 
 
-def test_polynomial_of_a_table_returns_its_coefficients_with_the_other_sign():
-    camera = look(1, replace_tangential(OWN))
-    polynomial = fit_radial_polynomial(radial_table_of(camera))
-    found = [polynomial.k1, polynomial.k2, polynomial.k3]
-    assert np.allclose(found, [-OWN.k1, -OWN.k2, -OWN.k3], rtol=1e-9)
-    lens = polynomial.lens(lens_centre(camera))
-    seen = np.random.default_rng(0).uniform([0, 0], [1279, 1023], (50, 2))
-    assert np.abs(lens.undistort(seen, camera.matrix_px) - camera.undistort(seen)).max() < 1e-9
-    subtracted = polynomial.correct(seen, lens_centre(camera))
-    assert np.abs(subtracted - camera.undistort(seen)).max() < 1e-9
-
-
-def test_k0_takes_up_a_scale():
-    radius = np.linspace(0, 800, 33)
-    truth = RadialPolynomial(k0=1e-3, k1=2e-8, k2=-3e-14)
-    table = RadialTable(radius, truth.delta(radius))
-    found = fit_radial_polynomial(table, terms=2, with_k0=True)
-    assert (found.k0, found.k1, found.k2) == pytest.approx((1e-3, 2e-8, -3e-14), rel=1e-8)
-    with pytest.raises(InputError, match=r"K0 = 0\.001 is a change of scale"):
-        found.lens([0, 0])
-
-
 def test_equation_6_2_at_one_point():
     table = RadialTable([0.0, 50.0, 100.0], [0.0, 1.0, 4.0])
     corrected = table.correct([[60.0 + 10, 80.0 + 20], [10.0, 20.0], [200.0, 0]], [10.0, 20.0])
@@ -292,12 +268,7 @@ def test_malformed_tables_are_refused(radius, delta):
         RadialTable(radius, delta)
 
 
-def test_impossible_fits_and_tables_are_refused():
-    table = RadialTable([0.0, 100.0, 200.0], [0.0, 1.0, 4.0])
-    with pytest.raises(InputError, match="2 rows beside the centre for 3 coefficients"):
-        fit_radial_polynomial(table)
-    with pytest.raises(InputError, match="4 radial terms"):
-        fit_radial_polynomial(table, terms=4)
+def test_impossible_tables_are_refused():
     with pytest.raises(InputError, match="not finite"):
         RadialTable([0.0, np.nan], [0.0, 1.0])
     with pytest.raises(InputError, match="1 rows"):

@@ -8,7 +8,7 @@ import pytest
 from scipy.optimize import least_squares
 
 from closerange.errors import GeometryError
-from closerange.verification.bound import BROWN, parameter_bound, position_bound, rms_3d_mm
+from closerange.verification.bound import BROWN, position_bound, rms_3d_mm
 from closerange.verification.scenes import (
     control_grid,
     looking_at_origin,
@@ -67,14 +67,18 @@ def test_coplanar_control_does_not_bound_anything():
     """One homography has 8 numbers; 4 of the camera and 6 of the pose do not follow from it."""
     camera = looking_at_origin("c", angle_rad=0.4, distance_mm=350, focal_px=1300)
     names = [name for name in BROWN if name not in ("k1", "k2", "p1", "p2")]
+    cameras, somewhere = (camera, rig_b().cameras[1]), [[10.0, 5.0, -20.0]]
     with pytest.raises(GeometryError, match="do not fix"):
-        parameter_bound(camera, names, control_grid((5, 5, 1)).xyz_mm, 0.05)
-    assert np.isfinite(parameter_bound(camera, names, control_grid(27).xyz_mm, 0.05)).all()
+        position_bound(cameras, names, control_grid((5, 5, 1)).xyz_mm, somewhere, 0.05)
+    bound = position_bound(cameras, names, control_grid(27).xyz_mm, somewhere, 0.05)
+    assert np.isfinite(bound).all()
 
 
 def test_too_few_points_are_refused():
     with pytest.raises(GeometryError, match="8 image coordinates cannot fix 14"):
-        parameter_bound(rig_b().cameras[0], BROWN, control_grid((2, 2, 1)).xyz_mm, 0.05)
+        position_bound(
+            rig_b().cameras, BROWN, control_grid((2, 2, 1)).xyz_mm, np.zeros((1, 3)), 0.05
+        )
 
 
 def test_more_points_lower_the_calibration_part_alone():

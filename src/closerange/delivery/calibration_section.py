@@ -10,6 +10,7 @@ import numpy as np
 from closerange.delivery.excerpts import shown
 from closerange.delivery.facts import fact_blocks
 from closerange.delivery.layout3d import Group, draw_layout, draw_points, paper_up
+from closerange.delivery.lens_blocks import lens_blocks
 from closerange.delivery.plots import magnification, vector_plot
 from closerange.delivery.sheet import Block, Contents, Figure, Paragraph, Section, Table
 from closerange.delivery.svg import BLUE, FULL_WIDTH, GREEN, VERMILION
@@ -77,6 +78,7 @@ def calibration_section(contents: Contents) -> Section | None:
         blocks += _left_out_points(rig.residuals)
     if rig.parameters:
         blocks.append(_parameter_table(rig))
+    blocks += lens_blocks(rig.cameras)
     blocks += fact_blocks("How it was calculated and what was fixed", _other_facts(rig.report))
     return Section("calibration", "Calibration", tuple(blocks))
 

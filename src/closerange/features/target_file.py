@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import tomllib
 import warnings
 from collections.abc import Callable
@@ -10,9 +9,9 @@ from pathlib import Path, PurePosixPath, PureWindowsPath
 from typing import Any
 
 from closerange.errors import CloseRangeWarning, SchemaError
-from closerange.features.control import ControlPoints, read_control, write_control
+from closerange.features.control import read_control
 from closerange.features.target import Charuco, Chessboard, DiscGrid, Target
-from closerange.files import read_text, write_text
+from closerange.files import read_text
 
 MAX_BYTES = 2**20
 """Largest target file read (1 MiB; ten lines are the rule)."""
@@ -73,38 +72,6 @@ def read_target(path: Path | str) -> Target:
     except SchemaError as error:  # the pattern knows the limit, here the file is known
         prefix = "" if error.message.startswith(str(path)) else f"{path}: "
         raise SchemaError(f"{prefix}{error.message}", remedy=error.remedy) from error
-
-
-def write_target(target: Target, path: Path | str) -> None:
-    """Write a target file that reads back as the same target.
-
-    Parameters
-    ----------
-    target : Target
-        The target. One of kind "points" gets its control table beside the file, named after
-        it: ``rig.toml`` and ``rig-points.csv``.
-    path : Path or str
-        TOML file, replaced whole or not at all.
-
-    Raises
-    ------
-    FileError
-        If it cannot be written.
-    """
-    path = Path(path)
-    lines: dict[str, Any] = {"kind": target.kind}
-    pattern = target.pattern
-    if pattern is None:
-        table = path.with_name(f"{path.stem}-points.csv")
-        control = ControlPoints.of(target.point, target.xyz_mm, std_mm=target.std_mm)
-        write_control(control, table)
-        lines["file"] = table.name
-    else:
-        lines |= {name: getattr(pattern, name) for name in pattern.__dataclass_fields__}
-        lines = {key: value for key, value in lines.items() if value not in ((), "")}
-        if target.std_mm.any():
-            lines["std_mm"] = float(target.std_mm[0])
-    write_text(path, "".join(f"{key} = {_toml(value)}\n" for key, value in lines.items()))
 
 
 def _disc_grid(document: dict[str, Any], path: Path) -> Target:
@@ -312,10 +279,3 @@ def _inside(path: Path, name: str) -> Path:
         f"{path}: file = {name!r}; it must lie in the target file's folder or below",
         remedy="put the table beside the target file and write its bare name",
     )
-
-
-def _toml(value: Any) -> str:
-    """Write a number, a text or nested lists of them; JSON's form of these is TOML too."""
-    if isinstance(value, tuple):
-        return "[" + ", ".join(_toml(item) for item in value) + "]"
-    return json.dumps(value, ensure_ascii=False)

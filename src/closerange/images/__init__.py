@@ -3,8 +3,8 @@
 A file becomes a `Frame` only if it is whole, of a known format, within stated limits, and if
 every grey value survives: the header is read and checked before OpenCV decodes a pixel, and
 what OpenCV returns is compared with it. Nothing is turned, stretched or cut to 8 bits. Images
-taken together form an `ImageSet`; sets are checked for orphans, duplicates, sizes and times,
-and single frames for being blank or interlaced.
+taken together form an `ImageSet`; sets are checked for orphans, duplicates and times, and
+single frames for being blank or interlaced.
 """
 
 from closerange.images.checks import (
@@ -12,7 +12,6 @@ from closerange.images.checks import (
     check_interlace,
     comb_share,
     noise_level,
-    saturated_share,
     structure_range,
 )
 from closerange.images.decode import MAX_IMAGE_BYTES, MAX_PIXELS, read_image
@@ -27,7 +26,6 @@ from closerange.images.headers import ImageHeader, read_header
 from closerange.images.image_sets import (
     ImageSet,
     check_duplicates,
-    check_sizes,
     distinct,
     group_images,
     placement_and_reading,
@@ -45,7 +43,6 @@ __all__ = [
     "check_exposures",
     "check_frame",
     "check_interlace",
-    "check_sizes",
     "comb_share",
     "distinct",
     "group_images",
@@ -57,6 +54,5 @@ __all__ = [
     "read_exposures",
     "read_header",
     "read_image",
-    "saturated_share",
     "structure_range",
 ]

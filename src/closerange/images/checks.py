@@ -102,26 +102,6 @@ def check_interlace(frame: Frame) -> list[str]:
     return notes
 
 
-def saturated_share(frame: Frame, *, full_scale: int | None = None) -> float:
-    """Return the share of pixels at full scale.
-
-    Parameters
-    ----------
-    frame : Frame
-        The image.
-    full_scale : int, optional
-        Value from which a pixel is saturated; the largest that the pixel type can hold, if
-        not given. A 12-bit camera that writes into 16 bits saturates at 4095 or at 65520.
-
-    Returns
-    -------
-    float
-        From 0 to 1, over the whole image.
-    """
-    limit = frame.full_scale if full_scale is None else full_scale
-    return float(np.count_nonzero(frame.pixels >= limit) / frame.pixels.size)
-
-
 def noise_level(frame: Frame) -> float:
     """Estimate the standard deviation of the noise of single pixels.
 

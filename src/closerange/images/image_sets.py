@@ -199,34 +199,6 @@ def distinct(frames: Iterable[Frame]) -> Iterator[Frame]:
         yield frame
 
 
-def check_sizes(frames: Iterable[Frame]) -> None:
-    """Refuse images of one camera that differ in size or in bit depth.
-
-    Parameters
-    ----------
-    frames : iterable of Frame
-        Frames of one or several cameras.
-
-    Raises
-    ------
-    InputError
-        Naming the camera, both files and both sizes.
-    """
-    first: dict[str, tuple[tuple[int, int], str, str]] = {}
-    for frame in frames:
-        kind = str(frame.pixels.dtype)
-        size, other_kind, source = first.setdefault(
-            frame.camera, (frame.size_px, kind, frame.source)
-        )
-        if (size, other_kind) != (frame.size_px, kind):
-            raise InputError(
-                f"camera {frame.camera!r}: {frame.source} has {frame.size_px[0]} x "
-                f"{frame.size_px[1]} pixels ({kind}), {source} has {size[0]} x {size[1]} "
-                f"({other_kind})",
-                remedy="use images of one camera, uncropped and with the same settings",
-            )
-
-
 def _by_key(camera: str, paths: Sequence[Path], pattern: str | None) -> dict[tuple[str, str], Path]:
     """Return a camera's files by placement and reading."""
     keyed: dict[tuple[str, str], Path] = {}

@@ -376,7 +376,8 @@ class _Fit:
         mass = np.maximum(trust.sum(axis=1), 1e-12)
         count = mass**2 / np.maximum((trust**2).sum(axis=1), 1e-12)
         free = np.maximum(count - 6, 1.0)
-        variance = np.einsum("np,np->n", trust, error**2) / mass * count / free + GREY_VARIANCE
+        variance = np.einsum("np,np->n", trust, error**2) / mass * count / free
+        variance = np.maximum(variance, GREY_VARIANCE)
         std = self._std(system)
         noise = self._noise(rows)
         # of a shift in any direction: an edge along the curve is steep only across it
@@ -415,7 +416,7 @@ class _Fit:
         squares = np.maximum((trust**2).sum(axis=1), 1e-12)
         count = np.maximum(trust.sum(axis=1), 1e-12) ** 2 / squares
         variance = np.einsum("np,np->n", trust**2, error**2) / squares / slope**2
-        variance = (variance + GREY_VARIANCE) * count / np.maximum(count - 6, 1.0)
+        variance = np.maximum(variance, GREY_VARIANCE) * count / np.maximum(count - 6, 1.0)
         inverse = np.linalg.inv(system.normal)
         doubled = system.basis * trust[:, :, None]
         middle = doubled.transpose(0, 2, 1) @ doubled

@@ -1,12 +1,12 @@
-"""Radial distortion as a table or a polynomial of the radius (section 6.2 of the thesis).
+"""Radial distortion as a table of the radius (section 6.2 of the thesis).
 
-Both state delta_r, by which an observed point lies too far out; it is SUBTRACTED, eq. (6.2):
+It states delta_r, by which an observed point lies too far out; it is SUBTRACTED, eq. (6.2):
 x_c = x (1 - delta_r / r). The corrections (6.5) of `BrownObserved` are ADDED: signs differ.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Iterable
 from dataclasses import dataclass
 
 import numpy as np
@@ -88,63 +88,12 @@ class RadialTable:
         ndarray, shape (N, 2)
             Corrected px; NaN beyond the table.
         """
-        return _corrected(xy_px, centre_px, self.delta)
-
-
-@dataclass(frozen=True, slots=True)
-class RadialPolynomial:
-    """Radial distortion delta_r = K0 r + K1 r^3 + K2 r^5 + K3 r^7, eq. (6.1).
-
-    Attributes
-    ----------
-    k0, k1, k2, k3 : float
-        In powers of 1/px; K0 is a change of scale (of focal length).
-    """
-
-    k0: float = 0.0
-    k1: float = 0.0
-    k2: float = 0.0
-    k3: float = 0.0
-
-    def delta(self, radius_px: ArrayLike) -> FloatArray:
-        """Return delta_r in px at observed radii in px."""
-        radius = np.asarray(radius_px, np.float64)
-        square = radius**2
-        delta: FloatArray = radius * (
-            self.k0 + square * (self.k1 + square * (self.k2 + square * self.k3))
-        )
-        return delta
-
-    def correct(self, xy_px: ArrayLike, centre_px: ArrayLike) -> FloatArray:
-        """Remove radial distortion, eq. (6.2); see `RadialTable.correct`."""
-        return _corrected(xy_px, centre_px, self.delta)
-
-    def lens(self, centre_px: ArrayLike) -> BrownObserved:
-        """Return the same correction as a lens.
-
-        Parameters
-        ----------
-        centre_px : array_like, shape (2,)
-            Principal point, px.
-
-        Returns
-        -------
-        BrownObserved
-            With the opposite signs: (6.5) adds what (6.2) subtracts.
-
-        Raises
-        ------
-        InputError
-            If K0 is not zero: scale belongs to the camera matrix.
-        """
-        if self.k0 != 0:
-            raise InputError(
-                f"K0 = {self.k0:.3g} is a change of scale, not of the lens; it must be 0 here",
-                remedy="fit without K0, or multiply fx and fy by 1 / (1 - K0)",
-            )
-        return BrownObserved(
-            -self.k1, -self.k2, -self.k3, centre_px=np.asarray(centre_px, np.float64)
-        )
+        centre = np.asarray(centre_px, np.float64)
+        offset = np.reshape(np.asarray(xy_px, np.float64), (-1, 2)) - centre
+        radius = np.hypot(offset[:, 0], offset[:, 1])
+        ratio = self.delta(radius) / np.where(radius > 0, radius, 1.0)  # 0 at the centre
+        corrected: FloatArray = centre + offset * (1 - ratio)[:, None]
+        return corrected
 
 
 def radial_table_of(camera: Camera, *, rows: int = 65) -> RadialTable:
@@ -187,51 +136,37 @@ def radial_table_of(camera: Camera, *, rows: int = 65) -> RadialTable:
     return RadialTable(radius[:known], delta[:known])
 
 
+def radial_tables(cameras: Iterable[Camera], *, rows: int = 65) -> dict[str, RadialTable]:
+    """Tabulate the radial distortion of all lenses that have one.
+
+    Parameters
+    ----------
+    cameras : iterable of Camera
+        Those of one rig.
+    rows : int, optional
+        As in `radial_table_of`.
+
+    Returns
+    -------
+    dict of str to RadialTable
+        By the camera's name; without lenses that do not distort or hold at their centre only.
+    """
+    found = {}
+    for camera in cameras:
+        try:
+            table = radial_table_of(camera, rows=rows)
+        except GeometryError:
+            continue
+        if table.delta_px.any():
+            found[camera.name] = table
+    return found
+
+
 def lens_centre(camera: Camera) -> FloatArray:
     """Return the px about which a camera's radial distortion is symmetric, shape (2,)."""
     if isinstance(camera.distortion, BrownObserved):
         return camera.distortion.centre_px
     return camera.matrix_px[:2, 2]
-
-
-def fit_radial_polynomial(
-    table: RadialTable, *, terms: int = 3, with_k0: bool = False
-) -> RadialPolynomial:
-    """Fit eq. (6.1) to a table by least squares.
-
-    Parameters
-    ----------
-    table : RadialTable
-        At least as many rows beside the first as coefficients.
-    terms : int, optional
-        How many of K1, K2, K3: 1 to 3.
-    with_k0 : bool, optional
-        Also fit K0.
-
-    Returns
-    -------
-    RadialPolynomial
-        Coefficients in powers of 1/px.
-
-    Raises
-    ------
-    InputError
-        If `terms` is not 1 to 3, or the table has too few rows.
-    """
-    if terms not in (1, 2, 3):
-        raise InputError(f"{terms} radial terms; eq. (6.1) has 1 to 3", remedy="use 1, 2 or 3")
-    powers = np.arange(0 if with_k0 else 1, terms + 1)
-    if len(table.radius_px) - 1 < len(powers):
-        raise InputError(
-            f"{len(table.radius_px) - 1} rows beside the centre for {len(powers)} coefficients",
-            remedy="add rows or fit fewer terms",
-        )
-    reach = table.radius_px[-1]
-    design = (table.radius_px / reach)[:, None] ** (2 * powers + 1)  # unit radius keeps digits
-    fitted = np.linalg.lstsq(design, table.delta_px, rcond=None)[0] / reach ** (2 * powers + 1)
-    return RadialPolynomial(
-        **{f"k{power}": float(value) for power, value in zip(powers, fitted, strict=True)}
-    )
 
 
 def _ideal_radius(camera: Camera, radius_px: FloatArray) -> FloatArray:
@@ -244,15 +179,3 @@ def _ideal_radius(camera: Camera, radius_px: FloatArray) -> FloatArray:
     radial: Distortion = lens.moved(**{term: -camera.parameter(term) for term in ("p1", "p2")})
     on_axis = np.column_stack([radius_px, np.zeros(len(radius_px))])
     return radial.undistort(on_axis, np.diag([focal, focal, 1.0]))[:, 0]
-
-
-def _corrected(
-    xy_px: ArrayLike, centre_px: ArrayLike, delta: Callable[[FloatArray], FloatArray]
-) -> FloatArray:
-    """Apply eq. (6.2); at the centre the ratio delta_r / r is left at 0."""
-    centre = np.asarray(centre_px, np.float64)
-    offset = np.reshape(np.asarray(xy_px, np.float64), (-1, 2)) - centre
-    radius = np.hypot(offset[:, 0], offset[:, 1])
-    ratio = delta(radius) / np.where(radius > 0, radius, 1.0)
-    corrected: FloatArray = centre + offset * (1 - ratio)[:, None]
-    return corrected

@@ -53,12 +53,6 @@ def centred_from_pixels(xy_px: ArrayLike, size_px: tuple[int, int]) -> FloatArra
     return centred
 
 
-def pixels_from_centred(xy_centred_px: ArrayLike, size_px: tuple[int, int]) -> FloatArray:
-    """Turn the thesis' image coordinates into pixels; the inverse of `centred_from_pixels`."""
-    pixels: FloatArray = np.asarray(xy_centred_px, np.float64) * (1.0, -1.0) + centre_of(size_px)
-    return pixels
-
-
 def centre_of(size_px: tuple[int, int]) -> FloatArray:
     """Return the image centre ((W - 1)/2, (H - 1)/2) in px, shape (2,)."""
     return (np.array(size_px, np.float64) - 1) / 2

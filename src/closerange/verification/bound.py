@@ -19,37 +19,6 @@ BROWN = ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2", "rx", "ry", "rz", "tx",
 _SINGULAR = 1e-6
 
 
-def parameter_bound(
-    camera: Camera, names: Sequence[str], control_mm: ArrayLike, noise_px: float
-) -> FloatArray:
-    """Bound the covariance of one camera's parameters, calibrated from exact points.
-
-    Parameters
-    ----------
-    camera : Camera
-        The truth.
-    names : sequence of str
-        Free parameters; see `Camera.parameter_jacobian`.
-    control_mm : array_like, shape (N, 3)
-        Control points; those that the camera cannot see are left out.
-    noise_px : float
-        Standard deviation of one image coordinate, independent.
-
-    Returns
-    -------
-    ndarray, shape (P, P)
-        ``noise^2 (J'J)^-1`` in the units of the parameters.
-
-    Raises
-    ------
-    GeometryError
-        If the points do not fix the parameters.
-    """
-    root = _parameter_root(camera, names, control_mm)
-    bound: FloatArray = noise_px**2 * root @ root.T
-    return bound
-
-
 def position_bound(
     cameras: Sequence[Camera],
     names: Sequence[str],

@@ -14,6 +14,7 @@ from closerange.features.image_points import ImagePoints
 from closerange.flags import Flag
 from closerange.geometry.arrays import FloatArray, IntArray
 from closerange.position.positions import Positions
+from closerange.rig.radial_table import lens_centre, radial_tables
 from closerange.rig.rig import Rig
 from closerange.verification.acceptance import AcceptanceReport
 from closerange.verification.control_check import ControlCheck
@@ -23,6 +24,9 @@ from closerange.workflows.run import RunResult
 from closerange.workflows.verify import Result
 
 AXES = ("x", "y", "z")
+
+RADIAL_ROWS = 17
+"""Rows of a lens' table: a monotone cubic between them is good to 0.01 px of 100 px."""
 
 
 def lines(*pairs: tuple[str, object]) -> str:
@@ -76,6 +80,7 @@ def rig_summary(rig: Rig, output: Path | None) -> dict[str, Any]:
         "dof": rig.dof,
         "volume_mm": rig.volume_mm.tolist(),
         "outliers": _outliers(rig),
+        "radial_distortion": _radial(rig),
         "trust": None
         if trust is None
         else {
@@ -85,6 +90,18 @@ def rig_summary(rig: Rig, output: Path | None) -> dict[str, Any]:
             "reasons": list(trust.reasons),
         },
         "output": None if output is None else str(output),
+    }
+
+
+def _radial(rig: Rig) -> dict[str, Any]:
+    """Tabulate how far observed points lie too far out: to be subtracted (section 6.2)."""
+    return {
+        name: {
+            "centre_px": lens_centre(rig.camera(name)).tolist(),
+            "radius_px": table.radius_px.tolist(),
+            "delta_px": table.delta_px.tolist(),
+        }
+        for name, table in radial_tables(rig.cameras, rows=RADIAL_ROWS).items()
     }
 
 
