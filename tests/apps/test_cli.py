@@ -97,6 +97,8 @@ def test_detection(chain):
     assert found["rows"] == found["found"] == found["unflagged"] == 27  # 9 discs, 3 heights
     assert found["image_size"] == {"left": [640, 512]}
     assert found["flags"] == {}
+    assert [entry["camera"] for entry in found["thresholds"]] == ["left"] * 3
+    assert all(entry["threshold"] in entry["fixed_points"] for entry in found["thresholds"])
     assert chain[1]["right disc"]["found"] == 9  # 3 positions, 3 readings
 
 
@@ -107,6 +109,9 @@ def test_calibration(chain):
     assert rig["volume_mm"] == [[-50.0] * 3, [50.0] * 3]
     assert rig["points_fitted"] == 54
     assert rig["trust"]["verdict"] == "good"
+    lens = rig["radial_distortion"]["right"]
+    assert lens["delta_px"][0] == 0
+    assert lens["radius_px"][-1] > 380  # from the centre of 640 x 512 px to a corner
     # noise of the images is below 0.01 px; measured 0.0036 px
     assert 0 < rig["noise_px"] < 0.01
     assert (folder / "rig.html").read_text(encoding="utf-8").startswith("<!")

@@ -6,6 +6,7 @@ from closerange.delivery.excerpts import FOLD_ROWS, shown
 from closerange.delivery.report import render_report
 from closerange.delivery.sheet import Contents
 from closerange.delivery.table_sections import points_section, positions_section
+from closerange.features.threshold import ThresholdReport
 from closerange.position.positions import Positions
 
 
@@ -46,6 +47,22 @@ def test_one_nameless_job_has_no_column_for_its_name(points):
     table = points_section(Contents(title="t", points={"": points})).blocks[0]
     assert table.head[0] == "camera"
     assert table.texts == {0}
+
+
+def test_thresholds_that_could_have_been_others_are_listed(points):
+    several = ThresholdReport(91.5, (40.25, 91.5), (10.0, 30.0))
+    found = {
+        ("left", "z0", ""): several,
+        ("right", "z0", ""): ThresholdReport(80.0, (80.0,), (20.0,)),
+    }
+    blocks = points_section(
+        Contents(
+            title="t", points={"a": dataclasses.replace(points, thresholds=found), "b": points}
+        )
+    ).blocks
+    words, table = blocks[1:3]
+    assert "Of 2 images, 1 has more than one" in words.text
+    assert table.rows == [("a", "left", "z0", "grey values", "91.50", "40.25, 91.50")]
 
 
 def test_a_few_readings_at_many_positions_are_drawn_together():

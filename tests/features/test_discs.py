@@ -141,6 +141,25 @@ def test_drawn_discs_come_back(polarity):
     assert (np.diff(discs.xy_px[:, 1]) > -30).all()  # from top to bottom
 
 
+@pytest.mark.parametrize("strategy", ["global", "local"])
+def test_thresholds_are_told_in_grey_values(strategy):
+    level = 50 + 130 * draw(grid())
+    told = {}
+    for polarity, pixels in (("white-on-dark", level), ("dark-on-white", 255 - level)):
+        discs = find_discs(frame_of(pixels, noise=0.0), polarity=polarity, strategy=strategy)
+        told[polarity] = discs.thresholds
+    white, dark = told["white-on-dark"], told["dark-on-white"]
+    assert white.threshold in white.fixed_points or white.threshold == white.floor
+    if strategy == "global":
+        assert white.threshold == pytest.approx(115, abs=8)  # between 50 and 180
+        assert dark.threshold == pytest.approx(255 - white.threshold, abs=1)
+        assert white.image == dark.image == "grey values"
+    else:
+        assert 0 < white.threshold < 130  # above the surroundings
+        assert dark.threshold == pytest.approx(white.threshold, abs=0.1)
+        assert "top-hat" in dark.image
+
+
 def test_discs_in_the_shade_are_not_lost():
     """Light that falls off to a tenth: one threshold for all misses some, auto does not."""
     ellipses = grid()

@@ -2,12 +2,20 @@
 
 from __future__ import annotations
 
+import json
+
 import cv2
 import numpy as np
 import pytest
 
-from closerange.errors import InputError
-from closerange.features.threshold import fixed_points, threshold_report, trussell_threshold
+from closerange.errors import InputError, SchemaError
+from closerange.features.threshold import (
+    fixed_points,
+    threshold_documents,
+    threshold_report,
+    thresholds_from,
+    trussell_threshold,
+)
 
 
 def two_levels(rng, dtype=np.uint8, low=60, high=180, share=0.1, noise=8, size=40_000):
@@ -123,3 +131,29 @@ def test_one_grey_value_has_nothing_above_it():
 def test_nothing_to_threshold_is_refused(pixels):
     with pytest.raises(InputError, match=r"remedy: "):
         trussell_threshold(pixels)
+
+
+@pytest.mark.parametrize(("factor", "offset"), [(1 / 16, 0.0), (-1.0, 255.0)])
+def test_in_other_units_it_is_the_report_of_the_other_values(factor, offset):
+    rng = np.random.default_rng(2)
+    low, high = two_levels(rng, low=20, high=60, share=0.02), two_levels(rng, high=230, size=2000)
+    pixels = np.concatenate([low, high])
+    found = threshold_report(pixels).in_units(factor, offset, image="other")
+    wanted = threshold_report(factor * pixels.astype(float) + offset)
+    assert found.threshold == pytest.approx(wanted.threshold)
+    assert found.fixed_points == pytest.approx(wanted.fixed_points)
+    assert found.between_class_variance == pytest.approx(wanted.between_class_variance)
+    assert (found.floor, found.image) == (-np.inf, "other")
+
+
+def test_thresholds_come_back_from_their_documents():
+    pixels = two_levels(np.random.default_rng(3))
+    reports = {
+        ("left", "z0", ""): threshold_report(pixels),
+        ("right", "z0", "2"): threshold_report(pixels, floor=7.5).in_units(0.5, image="top-hat"),
+    }
+    documents = json.loads(json.dumps(threshold_documents(reports), allow_nan=False))
+    assert thresholds_from(documents) == reports
+    for broken in ([{}], [{**documents[0], "threshold": "high"}], ["x"], 3):
+        with pytest.raises(SchemaError, match="thresholds: malformed"):
+            thresholds_from(broken)

@@ -23,8 +23,11 @@ PAINT_SCALE = 2.0
 
 _SHIFT = 4  # OpenCV's fixed-point coordinates: sixteenths of a pixel
 _HERSHEY_HEIGHT = 30.0  # units of the font that stand for its size
+_LETTER = 0.48  # mean width of a letter per font size, as of the sans serif fonts of pages
 # the painter's font has no other letters
-_ASCII = str.maketrans({"\u00b5": "u", TIMES: "x", "\u00b1": "+-", DASH: "-", "\u00b2": "2"})
+_ASCII = str.maketrans(
+    {"\u00b5": "u", TIMES: "x", "\u00b1": "+-", DASH: "-", "\u00b2": "2", "\u2212": "-"}
+)
 
 
 @dataclass(slots=True)
@@ -144,7 +147,7 @@ class _Painter:
             "line": self._line,
             "circle": self._circle,
             "polyline": self._chain,
-            "polygon": self._chain,
+            "polygon": self._polygon,
             "text": self._text,
             "image": self._image,
             "dots": self._dots,
@@ -201,8 +204,13 @@ class _Painter:
         self._polygons([ends], {**style, "fill": "none"}, closed=False)
 
     def _chain(self, _: str, style: dict[str, Any]) -> None:
-        numbers = [float(text) for text in re.split(r"[ ,]+", str(style["points"]).strip())]
-        self._polygons([self._at(numbers)], style, closed=style.get("fill", "none") != "none")
+        self._polygons([self._corners(style)], style, closed=False)
+
+    def _polygon(self, _: str, style: dict[str, Any]) -> None:
+        self._polygons([self._corners(style)], style, closed=True)
+
+    def _corners(self, style: dict[str, Any]) -> NDArray[np.int32]:
+        return self._at([float(text) for text in re.split(r"[ ,]+", str(style["points"]).strip())])
 
     def _circle(self, _: str, style: dict[str, Any]) -> None:
         centre = self._at([(style["cx"], style["cy"])])[0]
@@ -220,6 +228,13 @@ class _Painter:
         thick = max(1, round(size * (3.4 if bold else 2)))
         font = cv2.FONT_HERSHEY_SIMPLEX
         (width, _), _ = cv2.getTextSize(text, font, size, thick)
+        # OpenCV 4 has a wider font than a page: its texts would run into each other
+        room = _LETTER * float(style.get("font_size", 11)) * self.scale * len(text)
+        if style.get("text_anchor", "start") == "start":
+            room = min(room, self.pixels.shape[1] - float(style["x"]) * self.scale)
+        if width > room:
+            size *= room / width
+            width = room
         share = {"middle": 0.5, "end": 1.0}.get(str(style.get("text_anchor", "start")), 0.0)
         at = (
             round(float(style["x"]) * self.scale - share * width),

@@ -134,9 +134,9 @@ class ElementPicture:
             "element_px": self.element_px.tolist(),
             "mapped_px": self.mapped_px.tolist(),
             "missing": self.missing.tolist(),
-            "segment_px": np.round(self.segment_px, 3).tolist(),
+            "segment_px": self.segment_px.tolist(),
             "mismatch": self.mismatch.tolist(),
-            "depth_mm": np.round(self.depth_mm, 4).tolist(),
+            "depth_mm": self.depth_mm.tolist(),
         }
 
     @classmethod
@@ -334,9 +334,9 @@ def _picture(
         element_px=search.element_px,
         mapped_px=mapped,
         missing=~_present(masks[1], mapped),
-        segment_px=search.places,
+        segment_px=np.round(search.places, 3),  # enough for a picture
         mismatch=search.mismatch,
-        depth_mm=search.depth_mm,
+        depth_mm=np.round(search.depth_mm, 4),
     )
 
 

@@ -106,7 +106,7 @@ def _draw(canvas: Canvas, histogram: Histogram, corner: Point, size: Point) -> N
 
 def _edges(known: FloatArray) -> FloatArray:
     """Return the ends of round bars from 0, or from the least value, to the last hundredth."""
-    high = float(np.quantile(known, 0.99))
+    high = float(np.quantile(known, 0.99, method="lower"))
     low = min(0.0, float(known.min()))
     step = nice_step(max(high - low, 1e-9), BINS)
     bars = max(int(np.ceil((high - low) / step - 1e-9)), 1)

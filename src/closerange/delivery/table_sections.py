@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from collections import Counter
+from collections.abc import Mapping
 from dataclasses import replace
 
 import numpy as np
 
 from closerange.delivery.excerpts import shown
 from closerange.delivery.plots import axis_panels, panel_grid
-from closerange.delivery.sheet import Block, Contents, Figure, Section, Table
+from closerange.delivery.sheet import Block, Contents, Figure, Paragraph, Section, Table
 from closerange.delivery.wording import (
     counted,
     fixed,
@@ -51,6 +52,7 @@ def points_section(contents: Contents) -> Section | None:
     )
     caption = "Image points of each camera, with the standard deviation that their fit states"
     blocks: list[Block] = [shown(rows, caption, head, texts=frozenset({0, 1}))]
+    blocks += _thresholds(contents.points)
     if flagged:
         names = ("job", "camera", "placement", "point", "x [px]", "y [px]", "flags")
         texts = frozenset({0, 1, 2, 3, 6})
@@ -88,6 +90,37 @@ def positions_section(contents: Contents) -> Section | None:
         # rows that were compared with a truth are printed there
         blocks.append(replace(table, folded=True, printed=False) if name in compared else table)
     return Section("positions", "Positions", tuple(blocks))
+
+
+def _thresholds(points: Mapping[str, ImagePoints]) -> list[Block]:
+    """Say which images Trussell's iteration could have split elsewhere."""
+    reports = [(job, *item) for job, table in points.items() for item in table.thresholds.items()]
+    if not reports:
+        return []
+    rows = [
+        (
+            *(job, camera, placement, reading, report.image),
+            significant(report.threshold, 4),
+            ", ".join(significant(point, 4) for point in report.fixed_points),
+        )
+        for job, (camera, placement, reading), report in reports
+        if len(report.fixed_points) > 1
+    ]
+    several = f"{len(rows)} {'has' if len(rows) == 1 else 'have'}"
+    text = (
+        "Discs were separated from the background by Trussell's threshold, half-way between the "
+        f"means of what it separates. Of {counted(len(reports), 'image')}, {several} more than one "
+        "such value (fixed point), and that of the largest variance between the classes is taken, "
+        "whatever the start."
+    )
+    if not rows:
+        return [Paragraph(text)]
+    head = (
+        *("job", "camera", "placement", "reading", "values"),
+        *("threshold taken", "all fixed points"),
+    )
+    caption = "Thresholds of images with more than one fixed point, in grey values"
+    return [Paragraph(text), shown(rows, caption, head, texts=frozenset({0, 1, 2, 3, 4, 6}))]
 
 
 def _points_row(points: ImagePoints, camera: str) -> tuple[str, ...]:

@@ -13,6 +13,7 @@ from closerange.features.disc_grid import label_discs
 from closerange.features.discs import Discs, find_discs, saturation_level
 from closerange.features.image_points import ImagePoints
 from closerange.features.target import Charuco, Chessboard, DiscGrid, Target
+from closerange.features.threshold import ThresholdReport
 from closerange.flags import Flag
 from closerange.geometry.arrays import IntArray
 from closerange.images.frame import Frame
@@ -64,7 +65,7 @@ def detect_target(
         saturated (then all rows carry the flag).
     """
     where = frame.source or f"image of camera {frame.camera!r}"
-    points = _find(frame, target, estimator, where)
+    points, report = _find(frame, target, estimator, where)
     flags = _with_saturation(frame, points, where)
     _warn_of_defects(flags, where)
     return ImagePoints.of(
@@ -79,11 +80,14 @@ def detect_target(
         disc_diameter_mm=target.diameters_mm,
         size_px={frame.camera: frame.size_px},
         noise_cov_px2=points.noise_cov_px2,
+        thresholds={(frame.camera, placement, reading): report} if report else None,
     )
 
 
-def _find(frame: Frame, target: Target, estimator: str, where: str) -> ImagePoints:
-    """Find the target's points by its kind; errors name the image."""
+def _find(
+    frame: Frame, target: Target, estimator: str, where: str
+) -> tuple[ImagePoints, ThresholdReport | None]:
+    """Find the target's points by its kind, with a disc grid's threshold; errors name the image."""
     pattern = target.pattern
     if pattern is None:
         raise DetectionError(
@@ -93,7 +97,7 @@ def _find(frame: Frame, target: Target, estimator: str, where: str) -> ImagePoin
     try:
         if isinstance(pattern, DiscGrid):
             return _discs(frame, target, pattern, estimator)
-        return _corners(frame, target, pattern)
+        return _corners(frame, target, pattern), None
     except DetectionError as error:
         message = error.message if where in error.message else f"{where}: {error.message}"
         raise DetectionError(message, remedy=error.remedy) from error
@@ -114,7 +118,9 @@ def _corners(frame: Frame, target: Target, pattern: Chessboard | Charuco) -> Ima
     )
 
 
-def _discs(frame: Frame, target: Target, grid: DiscGrid, estimator: str) -> ImagePoints:
+def _discs(
+    frame: Frame, target: Target, grid: DiscGrid, estimator: str
+) -> tuple[ImagePoints, ThresholdReport]:
     """Find, label and put in order the discs of a grid."""
     found = find_discs(frame, polarity=grid.polarity, estimator=estimator)
     index = _label(found, grid)
@@ -130,7 +136,7 @@ def _discs(frame: Frame, target: Target, grid: DiscGrid, estimator: str) -> Imag
     cut = (flags & Flag.at_border) != 0
     for array in (xy, ellipse, cov, noise):
         array[cut] = np.nan
-    return ImagePoints.of(
+    points = ImagePoints.of(
         camera=frame.camera,
         point=target.point,
         xy_px=xy,
@@ -139,6 +145,7 @@ def _discs(frame: Frame, target: Target, grid: DiscGrid, estimator: str) -> Imag
         ellipse=ellipse,
         noise_cov_px2=noise,
     )
+    return points, found.thresholds
 
 
 def _label(found: Discs, grid: DiscGrid) -> IntArray:

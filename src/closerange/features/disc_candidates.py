@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import cv2
@@ -50,7 +50,7 @@ class DiscCandidates:
         The strategy that was used, "global" or "local".
     thresholds : ThresholdReport
         Of the image for "global"; of the top-hat image of the scale with most candidates for
-        "local".
+        "local". In grey values of the image.
     noise : float
         Standard deviation of a pixel, robust over the image.
     """
@@ -92,7 +92,17 @@ def find_candidates(frame: Frame, *, polarity: str, strategy: str = "auto") -> D
         raise InputError(f"polarity {polarity!r}", remedy=f"use one of {', '.join(POLARITIES)}")
     if strategy not in STRATEGIES:
         raise InputError(f"strategy {strategy!r}", remedy=f"use one of {', '.join(STRATEGIES)}")
-    pixels = frame.pixels if polarity == "white-on-dark" else frame.full_scale - frame.pixels
+    if polarity == "white-on-dark":
+        return _find(frame.pixels, strategy)
+    found = _find(frame.full_scale - frame.pixels, strategy)
+    if found.strategy == "local":
+        return found
+    report = found.thresholds.in_units(-1.0, frame.full_scale, image=found.thresholds.image)
+    return replace(found, thresholds=report)
+
+
+def _find(pixels: NDArray[Any], strategy: str) -> DiscCandidates:
+    """Find bright blobs."""
     noise = pixel_noise(pixels)
     if strategy == "local":
         return _local(pixels, noise)
@@ -180,6 +190,7 @@ def _local(
         reports.append((len(found) - before, report))
     found = _without_doubles(found)
     report = max(reports, key=lambda item: item[0])[1]
+    report = report.in_units(1 / _steps(pixels), image="top-hat of the grey values")
     return DiscCandidates(tuple(found), _painted(found, fine.shape), "local", report, noise)
 
 
@@ -195,10 +206,14 @@ def _sides(shape: tuple[int, ...], size_px: float | None) -> list[int]:
 
 def _fine_steps(pixels: NDArray[Any]) -> NDArray[np.uint16]:
     """Smoothed image in sixteenths of a grey value, or in what 16 bits allow."""
-    steps = 16 if pixels.dtype == np.uint8 else 1
+    steps = _steps(pixels)
     smooth = cv2.GaussianBlur(pixels.astype(np.float32) * steps, (0, 0), SMOOTHING_PX)
     fine: NDArray[np.uint16] = np.rint(smooth).astype(np.uint16)
     return fine
+
+
+def _steps(pixels: NDArray[Any]) -> int:
+    return 16 if pixels.dtype == np.uint8 else 1
 
 
 def _floor(residue: NDArray[np.uint16]) -> float:

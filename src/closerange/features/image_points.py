@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from closerange.errors import InputError
+from closerange.features.threshold import Thresholds
 from closerange.geometry.arrays import FloatArray, IntArray, frozen_array, frozen_ints
 
 SYMMETRY = 1e-9
@@ -46,6 +47,9 @@ class ImagePoints:
     noise_cov_px2 : ndarray, shape (N, 2, 2)
         The part of `cov_px2` that differs between readings of a still scene, in px^2; NaN
         where unknown.
+    thresholds : dict of (str, str, str) to ThresholdReport
+        How discs were separated from the background, by camera, placement and reading; only
+        of images that were searched for discs. Tables in files do not hold it.
     """
 
     camera: tuple[str, ...]
@@ -59,6 +63,7 @@ class ImagePoints:
     reading: tuple[str, ...]
     size_px: Mapping[str, tuple[int, int]] = field(default_factory=dict)
     noise_cov_px2: FloatArray = field(default_factory=lambda: np.array(np.nan))
+    thresholds: Thresholds = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         count = len(self.camera)
@@ -81,6 +86,7 @@ class ImagePoints:
             frozen_array(self.disc_diameter_mm, (count,), "disc_diameter_mm"),
         )
         set_field(self, "size_px", dict(self.size_px))
+        set_field(self, "thresholds", dict(self.thresholds))
         self._require_covariances("cov_px2")
         self._require_covariances("noise_cov_px2")
         keys = self.keys()
@@ -123,6 +129,7 @@ class ImagePoints:
         disc_diameter_mm: ArrayLike | None = None,
         size_px: Mapping[str, tuple[int, int]] | None = None,
         noise_cov_px2: ArrayLike | None = None,
+        thresholds: Thresholds | None = None,
     ) -> ImagePoints:
         """Build from whatever is known; the rest becomes NaN, blank or 0.
 
@@ -132,7 +139,7 @@ class ImagePoints:
             One name for all rows, or one a row.
         point : sequence of str
             One name a row.
-        xy_px, cov_px2, flags, ellipse, disc_diameter_mm, size_px, noise_cov_px2
+        xy_px, cov_px2, flags, ellipse, disc_diameter_mm, size_px, noise_cov_px2, thresholds
             As the attributes; `disc_diameter_mm` may be one number for all rows.
 
         Returns
@@ -164,6 +171,7 @@ class ImagePoints:
             reading=names(reading),
             size_px=size_px or {},
             noise_cov_px2=numbers(noise_cov_px2, (count, 2, 2)),
+            thresholds=thresholds or {},
         )
 
     def __len__(self) -> int:
@@ -190,6 +198,7 @@ class ImagePoints:
             reading=self.reading + other.reading,
             size_px={**self.size_px, **other.size_px},
             noise_cov_px2=np.concatenate([self.noise_cov_px2, other.noise_cov_px2]),
+            thresholds={**self.thresholds, **other.thresholds},
         )
 
     def keys(self) -> list[Key]:
@@ -234,6 +243,7 @@ class ImagePoints:
             reading=tuple(self.reading[i] for i in index),
             size_px=self.size_px,
             noise_cov_px2=self.noise_cov_px2[index],
+            thresholds=self.thresholds,
         )
 
     def of_camera(self, camera: str) -> ImagePoints:

@@ -2,19 +2,22 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
 
-from closerange.errors import InputError
+from closerange.errors import InputError, SchemaError
 from closerange.geometry.arrays import FloatArray
 
 NOISE_CEILING = 0.61
 """Blur-minimum strength, in standard deviations of the pixels' noise, that one pixel in a thousand
 of pure white noise exceeds (9 million pixels drawn; 0.607). An image of parts has an edge at one
 pixel in fifty or so: noise then makes at most a few per cent of what is called an edge."""
+
+_NAMES = ("camera", "placement", "reading")
 
 
 @dataclass(frozen=True, slots=True)
@@ -31,12 +34,39 @@ class ThresholdReport:
         Otsu's criterion at each fixed point.
     floor : float
         Noise floor below which no fixed point was accepted; -inf without one.
+    image : str
+        What was thresholded.
     """
 
     threshold: float
     fixed_points: tuple[float, ...]
     between_class_variance: tuple[float, ...]
     floor: float = -np.inf
+    image: str = "grey values"
+
+    def in_units(self, factor: float, offset: float = 0.0, *, image: str) -> ThresholdReport:
+        """Return the report of ``factor * values + offset``.
+
+        Parameters
+        ----------
+        factor, offset : float
+            A negative factor exchanges dark and bright.
+        image : str
+            What these values are.
+
+        Returns
+        -------
+        ThresholdReport
+            Fixed points ascending again.
+        """
+        order = 1 if factor > 0 else -1
+        return ThresholdReport(
+            factor * self.threshold + offset,
+            tuple(factor * point + offset for point in self.fixed_points)[::order],
+            tuple(factor**2 * variance for variance in self.between_class_variance)[::order],
+            factor * self.floor + offset if np.isfinite(self.floor) else self.floor,
+            image,
+        )
 
 
 def threshold_report(pixels: NDArray[Any], *, floor: float = -np.inf) -> ThresholdReport:
@@ -125,6 +155,62 @@ def edge_threshold(strength: NDArray[Any], *, noise: float) -> ThresholdReport:
     variances = tuple(step**2 * variance for variance in report.between_class_variance)
     threshold = min((point for point in points if point >= floor), default=floor)
     return ThresholdReport(threshold, points, variances, floor)
+
+
+Thresholds: TypeAlias = Mapping[tuple[str, str, str], ThresholdReport]
+"""By camera, placement and reading."""
+
+
+def threshold_documents(thresholds: Thresholds) -> list[dict[str, Any]]:
+    """Return the thresholds of images JSON-ready; a floor that there is none becomes None."""
+    return [
+        {
+            **dict(zip(_NAMES, key, strict=True)),
+            "image": report.image,
+            "threshold": report.threshold,
+            "fixed_points": list(report.fixed_points),
+            "between_class_variance": list(report.between_class_variance),
+            "floor": report.floor if np.isfinite(report.floor) else None,
+        }
+        for key, report in thresholds.items()
+    ]
+
+
+def thresholds_from(documents: Iterable[Mapping[str, Any]]) -> Thresholds:
+    """Rebuild thresholds from `threshold_documents`.
+
+    Parameters
+    ----------
+    documents : iterable of mapping
+        Parsed JSON.
+
+    Returns
+    -------
+    dict
+        By camera, placement and reading.
+
+    Raises
+    ------
+    SchemaError
+        If they are no such documents.
+    """
+    camera, placement, reading = _NAMES
+    try:
+        return {
+            (str(entry[camera]), str(entry[placement]), str(entry[reading])): ThresholdReport(
+                float(entry["threshold"]),
+                tuple(float(point) for point in entry["fixed_points"]),
+                tuple(float(variance) for variance in entry["between_class_variance"]),
+                -np.inf if entry["floor"] is None else float(entry["floor"]),
+                str(entry["image"]),
+            )
+            for entry in documents
+        }
+    except (KeyError, TypeError, ValueError) as error:
+        raise SchemaError(
+            f"thresholds: malformed document ({type(error).__name__}: {error})",
+            remedy="write the result again with this version of the program",
+        ) from error
 
 
 def fixed_points(pixels: NDArray[Any]) -> tuple[float, ...]:

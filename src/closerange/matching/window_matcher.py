@@ -48,6 +48,9 @@ FARTHEST_PX = 3.0
 SWEPT_PX = 1.0
 """Standard deviation of a swept place."""
 
+SUPPORT = 0.5
+"""Share of a window's information that must belong to the plane found."""
+
 CLIPPED = 0.01
 """Share of a window's pixels at full scale that makes it saturated."""
 
@@ -257,7 +260,7 @@ class _Job:
         return sizes
 
     def _textured(self, rays: SeedRays, omega: FloatArray, size: IntArray) -> _Found:
-        places = self._places(self.pencil, rays, omega, self.greys)
+        places = self._places(self.pencil, rays, omega, size, self.greys)
         best, rival = (self._refined(rays, places, size, column) for column in (0, 1))
         evidence, best = _better(rays, places, best, rival)
         best = _held(rays, places, best)
@@ -280,11 +283,11 @@ class _Job:
                 (Flag.not_found, lost),
                 (Flag.not_converged, ~best.converged & ~lost),
                 (Flag.ambiguous, evidence < EVIDENCE),
-                (Flag.poor_fit, best.misfit_px > MISFIT_PX),
+                (Flag.poor_fit, (best.misfit_px > MISFIT_PX) | (best.support < SUPPORT)),
                 (Flag.aperture, best.std_px > UNSURE_PX),
                 (Flag.at_border, best.inside < COMPLETE),
                 (Flag.saturated, share > CLIPPED),
-                (Flag.inconsistent, ~lost & ~self._returns(rays, best.omega)),
+                (Flag.inconsistent, ~lost & ~self._returns(rays, best.omega, size)),
             ):
                 found.flags[where] |= int(flag)
         return found
@@ -294,15 +297,22 @@ class _Job:
         pencil: Pencil,
         rays: SeedRays,
         omega: FloatArray,
+        size: IntArray,
         greys: tuple[NDArray[Any], ...],
     ) -> Places:
-        middle = np.nanmedian(omega, axis=1)
-        tilts = tilt_hypotheses(rays, middle, REACH)
+        """Sweep along the segments, beginning where eleven samples cover the window."""
+        tilts = tilt_hypotheses(rays, np.nanmedian(omega, axis=1), REACH)
         samples = int(np.quantile(np.isfinite(omega).sum(axis=1), 0.9))
-        sizes = [min(camera.size_px) for camera in (pencil.first, pencil.second)]
-        level = start_level(samples, len(tilts), (min(sizes), min(sizes)))
-        first, second = (pyramid(grey, level) for grey in greys)
-        return find_places(rays, omega, (first, second), tilts)
+        sides = min(min(camera.size_px) for camera in (pencil.first, pencil.second))
+        least = start_level(samples, len(tilts), (sides, sides))
+        wanted = np.ceil(np.log2(np.maximum(size, REACH) / REACH)).astype(np.int64)
+        level = np.maximum(least, wanted)
+        result = Places.empty(len(rays))
+        for top in np.unique(level):
+            rows = np.flatnonzero(level == top)
+            first, second = (pyramid(grey, int(top)) for grey in greys)
+            result.put(rows, find_places(rays.select(rows), omega[rows], (first, second), tilts))
+        return result
 
     def _refined(self, rays: SeedRays, places: Places, size: IntArray, column: int) -> Refined:
         result = Refined.empty(len(rays))
@@ -322,7 +332,7 @@ class _Job:
             result.put(rows, part)
         return result
 
-    def _returns(self, rays: SeedRays, omega: FloatArray) -> BoolArray:
+    def _returns(self, rays: SeedRays, omega: FloatArray, size: IntArray) -> BoolArray:
         """Mark matches that, matched back, come to their points again."""
         result = np.zeros(len(rays), dtype=bool)
         rows = np.flatnonzero(np.isfinite(omega))
@@ -335,11 +345,15 @@ class _Job:
         good = np.flatnonzero((flags == 0) & np.isfinite(span).any(axis=1))
         if not good.size:
             return result
-        places = self._places(backward, there.select(good), span[good], self.greys[::-1])
+        places = self._places(
+            backward, there.select(good), span[good], size[rows[good]], self.greys[::-1]
+        )
         met = there.select(good).at(places.omega[:, 0])
         home = rays.first.project(met) - rays.xy_px[rows[good]]
+        # large windows are swept where they are eleven samples wide, to half a sample
+        near = np.maximum(RETURN_PX, size[rows[good]] / (2 * REACH))
         with np.errstate(invalid="ignore"):
-            result[rows[good]] = np.linalg.norm(home, axis=1) < RETURN_PX
+            result[rows[good]] = np.linalg.norm(home, axis=1) < near
         return result
 
     def plain(self, rays: SeedRays, middle: FloatArray) -> _Found:

@@ -24,6 +24,10 @@ LONGEST_PX = 0.8
 SETTLED_PX = 0.1
 """A step below it shows that the match is near."""
 
+LEAST_SHIFT_PX = 0.1
+"""Residuals that a shift of so many px makes are not gross: what the lens and the surface do to an
+edge differs by as much from view to view."""
+
 STILL_PX = 0.004
 """A step below it ends the iteration: a fifth of what interpolation leaves."""
 
@@ -75,6 +79,8 @@ class Refined:
         Whether the last step was short.
     inside : ndarray, shape (N,)
         Share of the window that both images show.
+    support : ndarray, shape (N,)
+        Share of the window's information that was not let go as gross.
     """
 
     omega: FloatArray
@@ -85,12 +91,13 @@ class Refined:
     moved_px: FloatArray
     converged: BoolArray
     inside: FloatArray
+    support: FloatArray
 
     @classmethod
     def empty(cls, count: int) -> Refined:
         """Return so many failed fits; arrays may be filled in."""
         numbers = [np.full(count, np.nan) for _ in range(6)]
-        return cls(*numbers, np.zeros(count, dtype=bool), np.zeros(count))
+        return cls(*numbers, np.zeros(count, dtype=bool), np.zeros(count), np.zeros(count))
 
     def put(self, rows: IntArray, part: Refined) -> None:
         """Fill in rows."""
@@ -313,7 +320,9 @@ class _Fit:
         grey = self.grey[rows]
         error = sampled.values - state.gain[rows, None] * grey - state.offset[rows, None]
         spread = _spread(error, weight)
-        trust = weight / (1 + (error / (GROSS * spread[:, None])) ** 2) ** 2
+        # at a steep edge a small shift makes a large residual, and that is what is to be found
+        gross = GROSS * np.hypot(spread[:, None], self._shifted(rows) * state.gain[rows, None])
+        trust = weight / (1 + (error / gross) ** 2) ** 2
         gain = state.gain[rows, None]
         gained = gain * sampled.along
         x, y = self.mapping.offset.T * float(self.mapping.scale)
@@ -337,7 +346,13 @@ class _Fit:
         right[:, 1:3] -= np.einsum("nij,nj->ni", prior[:, 1:3, 1:3], state.turned[rows])
         right[:, 5] -= prior[:, 5, 5] * state.across[rows]
         normal += 1e-9 * np.eye(6) * np.trace(normal, axis1=1, axis2=2)[:, None, None]
-        return _System(normal, right, basis, trust, error, prior, weight, spread)
+        return _System(normal, right, basis, trust, error, prior, weight, spread, gross)
+
+    def _shifted(self, rows: IntArray) -> FloatArray:
+        """Return the residuals that a shift as large as the last step would make."""
+        last = np.clip(self.state.last[rows] / self.mapping.scale, LEAST_SHIFT_PX, 1.0)
+        slope = np.hypot(self.slopes[0][rows], self.slopes[1][rows])
+        return np.asarray(slope * last[:, None])
 
     def _noise_part(
         self,
@@ -363,8 +378,8 @@ class _Fit:
         part[:, 5, :3] = products[:, 0, 1, None] * moments[:, 0]
         part[:, :3, 5] = part[:, 5, :3]
         own = [0, 1, 2, 5]
-        share = part[:, own, own] / np.maximum(normal[:, own, own], 1e-12)
-        return np.asarray(part * np.minimum(MOST_NOISE / share.max(axis=1), 1.0)[:, None, None])
+        share = (part[:, own, own] / np.maximum(normal[:, own, own], 1e-12)).max(axis=1)
+        return np.asarray(part * (MOST_NOISE / np.maximum(share, MOST_NOISE))[:, None, None])
 
     def _judged(self) -> Refined:
         state, scale = self.state, self.mapping.scale
@@ -383,7 +398,9 @@ class _Fit:
         # of a shift in any direction: an edge along the curve is steep only across it
         both = system.basis[:, :, 0] ** 2 + system.basis[:, :, 5] ** 2
         steep = np.einsum("np,np->n", trust, both) / mass
+        whole_steep = np.einsum("np,np->n", weight, both)
         with np.errstate(divide="ignore", invalid="ignore"):
+            support = steep * mass / whole_steep
             misfit = np.sqrt(np.maximum(variance - noise, 0.0) / steep)
         total = np.maximum(weight.sum(axis=1), 1e-12)
         whole = np.einsum("np,np->n", weight, error**2) / total
@@ -402,6 +419,7 @@ class _Fit:
             moved_px=state.moved,
             converged=(state.last < 5 * STILL_PX * scale) & ~failed,
             inside=seen,
+            support=np.where(failed, 0.0, np.nan_to_num(support)),
         )
 
     def _std(self, system: _System) -> FloatArray:
@@ -410,7 +428,7 @@ class _Fit:
         # neighbouring residuals are alike, be it that noise was interpolated or the plane does
         # not fit
         weight, trust, error = system.weight, system.trust, system.error
-        far = (error / (GROSS * system.spread[:, None])) ** 2
+        far = (error / system.gross) ** 2
         slope = np.einsum("np,np->n", weight, (1 - 3 * far) / (1 + far) ** 3)
         slope = np.maximum(slope / np.maximum(trust.sum(axis=1), 1e-12), LEAST_SLOPE)
         squares = np.maximum((trust**2).sum(axis=1), 1e-12)
@@ -472,6 +490,7 @@ class _System:
     prior: FloatArray
     weight: FloatArray
     spread: FloatArray
+    gross: FloatArray
 
 
 def _gain(grey: FloatArray, values: FloatArray, weight: FloatArray) -> tuple[Any, Any]:

@@ -123,6 +123,8 @@ class BrownIdeal:
     @property
     def fold_radius(self) -> float:
         """Normalised radius beyond which the radial polynomial is no longer one-to-one."""
+        if not (self.k3 or self.k2):  # the usual short cases, without a search for roots
+            return float(np.sqrt(-1 / (3 * self.k1))) if self.k1 < 0 else np.inf
         roots = np.roots([7 * self.k3, 5 * self.k2, 3 * self.k1, 1.0])
         squares = [
             root.real for root in roots if abs(root.imag) < 1e-12 * abs(root) and root.real > 0

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 
 from closerange.geometry.arrays import FloatArray
@@ -52,7 +54,7 @@ class Projector:
         self, lens: FloatArray, rotation: FloatArray, shift: FloatArray
     ) -> tuple[FloatArray, FloatArray]:
         """Return residuals (2, N) and d calculated / d `PARAMETERS` (16, 2, N)."""
-        fx, fy, cx, cy, skew, k1, k2, k3, p1, p2 = lens
+        fx, fy, cx, cy, skew, k1, k2, k3, p1, p2 = lens.tolist()  # Python's numbers are quicker
         turned = rotation @ self.centred
         depth = turned[2] + shift[2]
         # NaN makes the search step back: points behind the camera, mirrored images
@@ -92,16 +94,18 @@ class Projector:
         jacobian[11] = turned[2] * by_x - turned[0] * by_z
         jacobian[12] = turned[0] * by_y - turned[1] * by_x
 
-        residual = self.seen - np.stack([fx * xd + skew * yd + cx, fy * yd + cy])
+        residual = self.seen.copy()
+        residual[0] -= fx * xd + skew * yd + cx
+        residual[1] -= fy * yd + cy
         return residual, jacobian
 
 
 def left_jacobian(vector: FloatArray) -> FloatArray:
     """D exp(w + dw) = exp(J dw) exp(w): what a change of the rotation vector turns by."""
-    angle = float(np.linalg.norm(vector))
+    angle = math.sqrt(float(vector @ vector))
     cross = cross_matrix(vector)
     # series near zero, where the closed forms lose all digits
-    first = 0.5 - angle**2 / 24 if angle < 1e-3 else (1 - np.cos(angle)) / angle**2
-    second = 1 / 6 - angle**2 / 120 if angle < 1e-3 else (angle - np.sin(angle)) / angle**3
+    first = 0.5 - angle**2 / 24 if angle < 1e-3 else (1 - math.cos(angle)) / angle**2
+    second = 1 / 6 - angle**2 / 120 if angle < 1e-3 else (angle - math.sin(angle)) / angle**3
     jacobian: FloatArray = np.eye(3) + first * cross + second * (cross @ cross)
     return jacobian

@@ -68,6 +68,10 @@ def whiten(
     if whitener is None:
         return residual, columns
     a, b, c = whitener.T
-    white = np.stack([a * residual[0], b * residual[0] + c * residual[1]])
+    white, rows = np.empty_like(residual), np.empty_like(columns)
+    white[0], white[1] = a * residual[0], b * residual[0] + c * residual[1]
     first = columns[:, 0]
-    return white, np.stack([a * first, b * first + c * columns[:, 1]], axis=1)
+    np.multiply(a, first, out=rows[:, 0])
+    np.multiply(b, first, out=rows[:, 1])
+    rows[:, 1] += c * columns[:, 1]
+    return white, rows

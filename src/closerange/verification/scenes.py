@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -260,7 +261,7 @@ def observe(
         behind a camera, is NaN and flagged `not_found`.
     """
     count = len(control)
-    columns: dict[str, list[str]] = {"camera": [], "placement": [], "point": [], "reading": []}
+    columns: dict[str, Any] = {"camera": [], "placement": [], "point": [], "reading": []}
     seen = []
     for camera in cameras:
         exact = camera.project(control.xyz_mm)

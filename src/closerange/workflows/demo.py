@@ -13,7 +13,7 @@ FOLDER = "closerange-demo"
 def demo(
     output: Path | str = FOLDER, *, overwrite: bool = False, announce: Announce | None = None
 ) -> RunResult:
-    """Calibrate two cameras, measure 90 positions and verify them, on shipped images.
+    """Calibrate two cameras, measure 90 positions, bars and blocks, and verify them.
 
     Parameters
     ----------

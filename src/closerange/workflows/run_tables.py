@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path, PureWindowsPath
 from typing import Any
 
 from closerange.errors import FileError, SchemaError
 from closerange.features.image_points import ImagePoints
 from closerange.features.points_table import read_points, write_points
+from closerange.features.threshold import threshold_documents, thresholds_from
 from closerange.files import MAX_TABLE_BYTES, read_limited, sha256
 from closerange.matching.correspondences import Correspondences
 from closerange.matching.matches_table import read_matches, write_matches
@@ -27,7 +29,7 @@ def write_tables(
     points: Mapping[str, ImagePoints],
     positions: Mapping[str, Positions],
     matches: Mapping[str, Correspondences] | None = None,
-) -> list[dict[str, str]]:
+) -> list[dict[str, Any]]:
     """Write the tables of a run.
 
     Parameters
@@ -40,9 +42,10 @@ def write_tables(
     Returns
     -------
     list of dict
-        One entry a table, for ``run.json``: ``job``, ``kind``, ``file``, ``sha256``.
+        One entry a table, for ``run.json``: ``job``, ``kind``, ``file``, ``sha256``, and of
+        detected points ``thresholds``, which a points table does not hold.
     """
-    entries = []
+    entries: list[dict[str, Any]] = []
     matches = matches or {}
     for job in dict.fromkeys((*points, *positions)):
         stem = job.replace(" ", "-")
@@ -51,7 +54,10 @@ def write_tables(
             entries.append({"job": job, "kind": MATCHES, "file": f"{stem}-matches.csv"})
         if job in points:
             write_points(points[job], folder / f"{stem}-points.csv")
-            entries.append({"job": job, "kind": POINTS, "file": f"{stem}-points.csv"})
+            entry: dict[str, Any] = {"job": job, "kind": POINTS, "file": f"{stem}-points.csv"}
+            if points[job].thresholds:
+                entry["thresholds"] = threshold_documents(points[job].thresholds)
+            entries.append(entry)
         if job in positions:
             write_positions(positions[job], folder / f"{stem}-positions.csv")
             entries.append({"job": job, "kind": POSITIONS, "file": f"{stem}-positions.csv"})
@@ -91,7 +97,8 @@ def read_tables(
         job, kind = str(entry["job"]), entry["kind"]
         path = _unchanged(str(entry["file"]), str(entry["sha256"]), folder, source=source)
         if kind == POINTS:
-            points[job] = read_points(path)
+            thresholds = thresholds_from(entry.get("thresholds", ()))
+            points[job] = replace(read_points(path), thresholds=thresholds)
         elif kind == POSITIONS:
             positions[job] = read_positions(path)
         elif kind == MATCHES:

@@ -11,6 +11,7 @@ import numpy as np
 
 from closerange.errors import DataError
 from closerange.features.image_points import ImagePoints
+from closerange.features.threshold import threshold_documents
 from closerange.flags import Flag
 from closerange.geometry.arrays import FloatArray, IntArray
 from closerange.position.positions import Positions
@@ -25,8 +26,8 @@ from closerange.workflows.verify import Result
 
 AXES = ("x", "y", "z")
 
-RADIAL_ROWS = 17
-"""Rows of a lens' table: a monotone cubic between them is good to 0.01 px of 100 px."""
+RADIAL_ROWS = 33
+"""Rows of a lens' table: a monotone cubic between them is good to 0.003 px of 100 px."""
 
 
 def lines(*pairs: tuple[str, object]) -> str:
@@ -40,8 +41,17 @@ def points_text(points: ImagePoints, output: Path) -> str:
     return lines(
         ("Points", f"{int(points.found.sum())} of {len(points)} found in {placements} images"),
         ("Flags", flags_text(points.flags)),
+        ("Thresholds", _bistable(points)),
         ("Written", output),
     )
+
+
+def _bistable(points: ImagePoints) -> str:
+    """Say where Trussell's iteration could have ended elsewhere."""
+    several = sum(len(report.fixed_points) > 1 for report in points.thresholds.values())
+    if not several:
+        return ""
+    return f"{several} of {len(points.thresholds)} images have several fixed points, see --json"
 
 
 def points_summary(points: ImagePoints, output: Path) -> dict[str, Any]:
@@ -51,6 +61,7 @@ def points_summary(points: ImagePoints, output: Path) -> dict[str, Any]:
         "found": int(points.found.sum()),
         "unflagged": int((points.flags == 0).sum()),
         "flags": flag_counts(points.flags),
+        "thresholds": threshold_documents(points.thresholds),
         "image_size": {name: list(size) for name, size in points.size_px.items()},
         "output": str(output),
     }
