@@ -48,6 +48,10 @@ FARTHEST_PX = 3.0
 SWEPT_PX = 1.0
 """Standard deviation of a swept place."""
 
+COARSE_FIRST = 14
+"""Half-width from which on windows are refined in smaller images first: a step that is not half as
+long as the details are wide finds its way, and in large windows the details are large."""
+
 SUPPORT = 0.5
 """Share of a window's information that must belong to the plane found."""
 
@@ -224,6 +228,7 @@ class _Job:
         self.pair = _Pair(pencil, greys, 0)
         for size in HALF_WIDTHS if half_width_px is None else ():
             self.pair.level(_scale(size))
+            self.pair.level(2 * _scale(size))
 
     def match(self, rays: SeedRays) -> _Found:
         """Match points with texture; mark those without as `no_edge`."""
@@ -305,7 +310,7 @@ class _Job:
         samples = int(np.quantile(np.isfinite(omega).sum(axis=1), 0.9))
         sides = min(min(camera.size_px) for camera in (pencil.first, pencil.second))
         least = start_level(samples, len(tilts), (sides, sides))
-        wanted = np.ceil(np.log2(np.maximum(size, REACH) / REACH)).astype(np.int64)
+        wanted = np.log2(np.maximum(size, REACH) / REACH).astype(np.int64)
         level = np.maximum(least, wanted)
         result = Places.empty(len(rays))
         for top in np.unique(level):
@@ -320,15 +325,19 @@ class _Job:
             rows = np.flatnonzero((size == width) & np.isfinite(places.omega[:, column]))
             if not rows.size:
                 continue
-            scale = _scale(int(width))
-            part = refine_windows(
-                rays.select(rows),
-                (places.omega[rows, column], places.tilt[rows, column]),
-                places.shape[rows],
-                (int(width) // scale, scale),
-                self.pair.level(scale),
-                self.epipolar_px,
-            )
+            some, shape, tilt = rays.select(rows), places.shape[rows], places.tilt[rows, column]
+            start, scale = places.omega[rows, column], _scale(int(width))
+            scales = [2 * scale, scale] if width >= COARSE_FIRST else [scale]
+            for used in scales:
+                part = refine_windows(
+                    some,
+                    (start, tilt),
+                    shape,
+                    (int(width) // used, used),
+                    self.pair.level(used),
+                    self.epipolar_px,
+                )
+                start = np.where(part.converged, part.omega, start)
             result.put(rows, part)
         return result
 

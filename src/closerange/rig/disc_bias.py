@@ -10,16 +10,18 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import cache
 
 import numpy as np
 from numpy.typing import NDArray
 
-from closerange.geometry.arrays import BoolArray, FloatArray, all_finite
+from closerange.geometry.arrays import BoolArray, FloatArray, all_finite, frozen_array
 from closerange.rig.camera import Camera
 
 _OUTLINE = 32  # points on the outline: the ellipse fit is exact for 5, distortion is smooth
 _SPHERE = 400  # first guesses of the normal: 6 degrees apart, well inside Gauss-Newton's basin
 _REFINEMENTS = 6
+ROOT_2 = float(np.sqrt(2.0))
 _CHUNK = 512  # discs at once: bounds the memory of the search
 
 
@@ -142,20 +144,29 @@ def _fit_normals(cameras: Sequence[Camera], discs: DiscViews, rows: NDArray[np.i
     weight = np.where(seen & np.isfinite(jacobians).all(axis=(2, 3)), 1 / size, 0.0)
     wanted, jacobians = np.nan_to_num(wanted), np.nan_to_num(jacobians)
 
+    flat = jacobians.reshape(len(rows), -1, 3)
+    whole = _three_terms(jacobians @ np.swapaxes(jacobians, 2, 3))[:, None]
+    seen_terms = (weight[..., None] * _three_terms(wanted)).reshape(len(rows), -1)
+
     def miss(normal: FloatArray) -> FloatArray:
-        """Relative shape residuals (m, g, C, 3) of g normals a disc, (m, g, 3), best factor s."""
-        along = np.einsum("mcij,mgj->mgci", jacobians, normal)
-        shape = (jacobians @ np.swapaxes(jacobians, 2, 3))[:, None]
-        shape = shape - along[..., :, None] * along[..., None, :]
-        w = weight[:, None, :, None]
-        seen_terms, shape_terms = w * _three_terms(wanted[:, None]), w * _three_terms(shape)
-        factor = np.sum(seen_terms * shape_terms, axis=(2, 3), keepdims=True)
-        factor = factor / np.maximum(np.sum(shape_terms**2, axis=(2, 3), keepdims=True), 1e-300)
-        residual: FloatArray = seen_terms - factor * shape_terms
+        """Relative shape residuals (m, g, 3C) of g normals a disc, (m, g, 3), best factor s."""
+        count = normal.shape[1]
+        along = normal @ np.swapaxes(flat, 1, 2)  # (m, g, 2C): x and y of each view
+        x, y = along[..., 0::2], along[..., 1::2]
+        shape = np.empty((len(rows), count, len(cameras), 3))
+        np.subtract(whole[..., 0], x * x, out=shape[..., 0])
+        np.subtract(whole[..., 1], ROOT_2 * x * y, out=shape[..., 1])
+        np.subtract(whole[..., 2], y * y, out=shape[..., 2])
+        shape *= weight[:, None, :, None]
+        shape = shape.reshape(len(rows), count, -1)
+        factor = (shape @ seen_terms[..., None])[..., 0]
+        factor /= np.maximum(np.einsum("mgk,mgk->mg", shape, shape), 1e-300)
+        shape *= factor[..., None]
+        residual: FloatArray = seen_terms[:, None] - shape
         return residual
 
     sphere = np.broadcast_to(_sphere(), (len(rows), _SPHERE, 3))
-    best = np.argmin(np.sum(miss(sphere) ** 2, axis=(2, 3)), axis=1)
+    best = np.argmin(_square(miss(sphere)), axis=1)
     normal = _sphere()[best]
     for _ in range(_REFINEMENTS):
         normal = _gauss_newton(miss, normal)
@@ -171,7 +182,6 @@ def _gauss_newton(miss: Callable[[FloatArray], FloatArray], normal: FloatArray) 
     u, v = _plane_axes(normal)
     trial = np.stack([normal, normal + step * u, normal + step * v], axis=1)
     residual = miss(trial / np.linalg.norm(trial, axis=2, keepdims=True))
-    residual = residual.reshape(len(normal), 3, -1)
     jacobian = np.swapaxes(residual[:, 1:] - residual[:, :1], 1, 2) / step
     curvature = np.swapaxes(jacobian, 1, 2) @ jacobian
     # a disc seen frontally has a flat optimum: damp so that noise cannot throw the normal away
@@ -180,18 +190,26 @@ def _gauss_newton(miss: Callable[[FloatArray], FloatArray], normal: FloatArray) 
     turn = np.clip(-np.linalg.solve(curvature, slope)[..., 0], -0.2, 0.2)
     turned = normal + turn[:, :1] * u + turn[:, 1:] * v
     turned /= np.linalg.norm(turned, axis=1, keepdims=True)
-    pair = np.sum(miss(np.stack([normal, turned], axis=1)) ** 2, axis=(2, 3))
+    pair = _square(miss(np.stack([normal, turned], axis=1)))
     better: FloatArray = np.where((pair[:, 1] < pair[:, 0])[:, None], turned, normal)
     return better
 
 
+def _square(residual: FloatArray) -> FloatArray:
+    """Sum of squares over the last axis."""
+    return np.einsum("mgk,mgk->mg", residual, residual)
+
+
+@cache
 def _sphere() -> FloatArray:
     """Return directions spread evenly over a half sphere (Fibonacci lattice)."""
     index = np.arange(_SPHERE) + 0.5
     z = 1 - index / _SPHERE
     turn = np.pi * (1 + np.sqrt(5)) * index
     flat = np.sqrt(1 - z * z)
-    return np.stack([flat * np.cos(turn), flat * np.sin(turn), z], axis=1)
+    return frozen_array(
+        np.stack([flat * np.cos(turn), flat * np.sin(turn), z], axis=1), (_SPHERE, 3), "sphere"
+    )
 
 
 def _plane_axes(normal: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -212,9 +230,7 @@ def _ellipse_matrices(ellipse: FloatArray) -> FloatArray:
 
 def _three_terms(matrix: FloatArray) -> FloatArray:
     """Return the terms of symmetric 2x2 matrices so that their norm is the Frobenius norm."""
-    return np.stack(
-        [matrix[..., 0, 0], np.sqrt(2.0) * matrix[..., 0, 1], matrix[..., 1, 1]], axis=-1
-    )
+    return np.stack([matrix[..., 0, 0], ROOT_2 * matrix[..., 0, 1], matrix[..., 1, 1]], axis=-1)
 
 
 def _ellipse_centres(points: FloatArray) -> FloatArray:

@@ -10,6 +10,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Protocol
@@ -123,8 +124,8 @@ class BrownIdeal:
     @property
     def fold_radius(self) -> float:
         """Normalised radius beyond which the radial polynomial is no longer one-to-one."""
-        if not (self.k3 or self.k2):  # the usual short cases, without a search for roots
-            return float(np.sqrt(-1 / (3 * self.k1))) if self.k1 < 0 else np.inf
+        if not self.k3:
+            return _first_root(5 * self.k2, 3 * self.k1)
         roots = np.roots([7 * self.k3, 5 * self.k2, 3 * self.k1, 1.0])
         squares = [
             root.real for root in roots if abs(root.imag) < 1e-12 * abs(root) and root.real > 0
@@ -229,6 +230,17 @@ class BrownObserved:
         forward[~np.isfinite(forward).all(axis=(1, 2))] = np.nan
         inverse: FloatArray = np.linalg.inv(forward)
         return inverse
+
+
+def _first_root(a: float, b: float) -> float:
+    """Return the root of the least s > 0 with a s^2 + b s + 1 = 0; infinite if there is none."""
+    discriminant = b * b - 4 * a
+    if discriminant < 0:
+        return np.inf
+    # Citardauq's form: no difference of nearly equal numbers, and no division by a = 0
+    both = [-b + sign * math.sqrt(discriminant) for sign in (1, -1)]
+    squares = [2 / value for value in both if value > 0]
+    return math.sqrt(min(squares)) if squares else np.inf
 
 
 def _normalised(pixels: FloatArray, matrix_px: FloatArray) -> FloatArray:

@@ -141,14 +141,16 @@ def left_out_errors(fit: CameraFit, view: View, group: IntArray) -> FloatArray:
     """
     _, index = np.unique(group, return_inverse=True)
     fold = index % min(FOLDS, index.max() + 1)
+    folds = [fold == number for number in range(fold.max() + 1)]
+    bases = [fit.orthonormal[rows].reshape(-1, len(fit.free)) for rows in folds]
+    rest = np.eye(len(fit.free)) - np.stack([q.T @ q for q in bases])
+    if np.linalg.eigvalsh(rest).min() < 1e-9:
+        raise GeometryError("a tenth of the points carries a parameter alone")
+    moments = [q.T @ fit.whitened[rows].ravel() for q, rows in zip(bases, folds, strict=True)]
+    changes = np.linalg.solve(rest, np.stack(moments)[..., None])[..., 0]
     left_out = fit.whitened.copy()
-    for number in range(fold.max() + 1):
-        rows = fold == number
-        q, r = fit.orthonormal[rows].reshape(-1, len(fit.free)), fit.whitened[rows].ravel()
-        rest = np.eye(len(fit.free)) - q.T @ q
-        if np.linalg.eigvalsh(rest)[0] < 1e-9:
-            raise GeometryError("a tenth of the points carries a parameter alone")
-        left_out[rows] = (r + q @ np.linalg.solve(rest, q.T @ r)).reshape(-1, 2)
+    for rows, q, change in zip(folds, bases, changes, strict=True):
+        left_out[rows] += (q @ change).reshape(-1, 2)
     pixels = _in_px(left_out, view.whitener)
     matrix = fit.camera.matrix_px
     depth = fit.camera.depth_mm(view.xyz_mm)

@@ -60,43 +60,48 @@ class Projector:
         # NaN makes the search step back: points behind the camera, mirrored images
         valid = (depth > 0) & bool(fx > 0 and fy > 0)
         per_depth = 1.0 / np.where(valid, depth, np.nan)
-        x, y = (turned[0] + shift[0]) * per_depth, (turned[1] + shift[1]) * per_depth
-        xx, yy, xy2 = x * x, y * y, 2 * x * y
-        r2 = xx + yy
-        along_x, along_y = r2 + 2 * xx, r2 + 2 * yy
+        # x and y stand in two rows: one call of NumPy does for both
+        point = (turned[:2] + shift[:2, None]) * per_depth
+        x, y = point
+        square, twice_xy = point * point, 2 * x * y
+        r2 = square[0] + square[1]
+        along = r2 + 2 * square
         radial = 1 + r2 * (k1 + r2 * (k2 + r2 * k3))
-        xd = x * radial + p1 * xy2 + p2 * along_x
-        yd = y * radial + p1 * along_y + p2 * xy2
+        seen = point * radial
+        seen[0] += p1 * twice_xy + p2 * along[0]
+        seen[1] += p1 * along[1] + p2 * twice_xy
 
+        focal = np.array([[fx], [fy]])
         jacobian = np.zeros((len(PARAMETERS), 2, x.size))
-        jacobian[0, 0], jacobian[1, 1], jacobian[4, 0] = xd, yd, yd
+        jacobian[0, 0], jacobian[1, 1], jacobian[4, 0] = seen[0], seen[1], seen[1]
         jacobian[2, 0] = jacobian[3, 1] = 1.0
-        power = r2
-        for row in (5, 6, 7):
-            jacobian[row, 1] = fy * (y * power)
-            jacobian[row, 0] = fx * (x * power)
-            power = power * r2
-        jacobian[8, 0], jacobian[8, 1] = fx * xy2, fy * along_y
-        jacobian[9, 0], jacobian[9, 1] = fx * along_x, fy * xy2
-        if skew:
-            jacobian[5:10, 0] += (skew / fy) * jacobian[5:10, 1]
+        np.multiply(focal * point, r2, out=jacobian[5])
+        np.multiply(jacobian[5], r2, out=jacobian[6])
+        np.multiply(jacobian[6], r2, out=jacobian[7])
+        jacobian[8, 0], jacobian[8, 1] = fx * twice_xy, fy * along[1]
+        jacobian[9, 0], jacobian[9, 1] = fx * along[0], fy * twice_xy
 
         slope = 2 * (k1 + r2 * (2 * k2 + 3 * k3 * r2))
-        dxx = (radial + slope * xx + 2 * p1 * y + 6 * p2 * x) * per_depth
-        dyy = (radial + slope * yy + 6 * p1 * y + 2 * p2 * x) * per_depth
-        dxy = (0.5 * slope * xy2 + 2 * p1 * x + 2 * p2 * y) * per_depth
+        bent = np.array([[p2], [p1]]) * point
+        straight = (radial + slope * square + 6 * bent + 2 * bent[::-1]) * per_depth
+        crossed = (0.5 * slope * twice_xy + 2 * p1 * x + 2 * p2 * y) * per_depth
         by_x, by_y, by_z = jacobian[13], jacobian[14], jacobian[15]
-        by_x[0], by_x[1] = fx * dxx + skew * dxy, fy * dxy
-        by_y[0], by_y[1] = fx * dxy + skew * dyy, fy * dyy
-        by_z[:] = -(x * by_x + y * by_y)
+        by_x[0], by_x[1] = fx * straight[0], fy * crossed
+        by_y[0], by_y[1] = fx * crossed, fy * straight[1]
+        if skew:
+            jacobian[5:10, 0] += (skew / fy) * jacobian[5:10, 1]
+            by_x[0] += skew * crossed
+            by_y[0] += skew * straight[1]
+        np.multiply(-x, by_x, out=by_z)
+        by_z -= y * by_y
         # d(exp(w) R X)/dw = -[R X]x, hence row . d/dw = (R X) x row
         jacobian[10] = turned[1] * by_z - turned[2] * by_y
         jacobian[11] = turned[2] * by_x - turned[0] * by_z
         jacobian[12] = turned[0] * by_y - turned[1] * by_x
 
-        residual = self.seen.copy()
-        residual[0] -= fx * xd + skew * yd + cx
-        residual[1] -= fy * yd + cy
+        residual = self.seen - focal * seen
+        residual[0] -= skew * seen[1] + cx
+        residual[1] -= cy
         return residual, jacobian
 
 

@@ -22,7 +22,8 @@ from closerange.rig.view import View, whiten
 ROUNDING_PX = 1e-6
 """Errors below this are rounding of exact data."""
 
-_HALVINGS = 60  # float64 has 52 binary digits
+_STEPS = 200
+_LAST_DIGIT = 4 * float(np.finfo(float).eps)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -89,19 +90,21 @@ def common_variance(residual_px: FloatArray, cov_px2: FloatArray, dof: int) -> f
     values = np.maximum(values, 0.0)
     floor = max(1e-12 * float(values.max(initial=0.0)), np.finfo(float).tiny)
 
-    def excess(tau2: float) -> float:
-        # a value of zero is rounding or an exact point: it must not overflow
-        return float(np.sum(square / np.maximum(values + tau2, floor))) - dof
-
-    low, high = 0.0, float(np.sum(square)) / dof
+    highest = float(np.sum(square)) / dof
     if not values.any():
-        return high
-    if excess(0.0) <= 0:
-        return 0.0
-    for _ in range(_HALVINGS):
-        middle = (low + high) / 2
-        low, high = (middle, high) if excess(middle) > 0 else (low, middle)
-    return high
+        return highest
+    tau2 = 0.0
+    for _ in range(_STEPS):
+        # a value of zero is rounding or an exact point: it must not overflow
+        total = np.maximum(values + tau2, floor)
+        terms = square / total
+        excess = float(terms.sum()) - dof
+        # The excess falls and is convex, so Newton's steps from below never pass the root.
+        step = excess / float((terms / total).sum()) if excess > 0 else 0.0
+        tau2 += step
+        if step <= _LAST_DIGIT * tau2:
+            break
+    return min(tau2, highest)
 
 
 def whitener_of(cov_px2: FloatArray) -> FloatArray:
