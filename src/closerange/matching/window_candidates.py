@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass, fields
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -72,14 +71,6 @@ class Places:
         """Fill in rows."""
         for item in fields(self):
             getattr(self, item.name)[rows] = getattr(part, item.name)
-
-
-def pyramid(grey: NDArray[np.float32], levels: int) -> list[NDArray[np.float32]]:
-    """Return an image and so many halvings of it; pixel x of a level is pixel 2 x of the finer."""
-    images = [grey]
-    while len(images) <= levels:
-        images.append(cv2.pyrDown(images[-1]))
-    return images
 
 
 def start_level(samples: int, hypotheses: int, size_px: tuple[int, int]) -> int:

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from closerange.features.grey_noise import WINDOW_PX, noise_curve
-from closerange.geometry.arrays import BoolArray, FloatArray, IntArray
+from closerange.geometry.arrays import FloatArray, IntArray
 from closerange.geometry.interpolation import bilinear
 
 HALF_WIDTHS = (5, 7, 10, 14, 20, 28, 40)
@@ -130,40 +130,6 @@ def chosen_sizes(
     return np.where(good.any(axis=0), good.argmax(axis=0), -1)
 
 
-def saturation(grey: NDArray[np.float32]) -> float:
-    """Return the grey value at which an image clips; infinite if it does not.
-
-    The largest value of an image is its full scale if it is that of a sensor of 8 to 16 bits.
-    """
-    largest = float(grey.max()) if grey.size else 0.0
-    scales = {float(2**bits - 1) for bits in (8, 10, 12, 14, 16)} | {
-        float((2**bits - 1) << (16 - bits)) for bits in (10, 12, 14)
-    }
-    return largest if largest in scales else np.inf
-
-
-def clipped_share(
-    grey: NDArray[np.float32], xy_px: FloatArray, half_width: FloatArray
-) -> FloatArray:
-    """Return the share of pixels at full scale in the square around each point, shape (N,)."""
-    full = grey >= saturation(grey)
-    if not full.any():
-        return np.zeros(len(xy_px))
-    total = cv2.integral(full.astype(np.uint8))
-    height, width = grey.shape
-    low = np.rint(xy_px - half_width[:, None]).astype(np.int64)
-    high = np.rint(xy_px + half_width[:, None]).astype(np.int64) + 1
-    limit = np.array([width, height])
-    low, high = np.clip(low, 0, limit), np.clip(high, 0, limit)
-    inside = (
-        total[high[:, 1], high[:, 0]]
-        - total[low[:, 1], high[:, 0]]
-        - total[high[:, 1], low[:, 0]]
-        + total[low[:, 1], low[:, 0]]
-    )
-    return np.asarray(inside / np.maximum((high - low).prod(axis=1), 1))
-
-
 def _window_sum(product: NDArray[Any], xy_px: FloatArray, sigma: float) -> FloatArray:
     """Sum under a Gaussian around each point; in a smaller image where the Gaussian is wide."""
     step = max(int(sigma // 2), 1)
@@ -176,10 +142,3 @@ def _window_sum(product: NDArray[Any], xy_px: FloatArray, sigma: float) -> Float
         product, (0, 0), sigma * ratio[0], sigmaY=sigma * ratio[1], borderType=cv2.BORDER_REPLICATE
     )
     return np.asarray(2 * np.pi * sigma**2 * bilinear(mean, (xy_px + 0.5) * ratio - 0.5))
-
-
-def within(xy_px: FloatArray, size_px: tuple[int, int], margin: float) -> BoolArray:
-    """Mark points at least so far from the border of an image, shape (N,)."""
-    limit = np.array(size_px) - 1 - margin
-    with np.errstate(invalid="ignore"):
-        return np.asarray(((xy_px >= margin) & (xy_px <= limit)).all(axis=1))

@@ -48,10 +48,6 @@ FARTHEST_PX = 3.0
 SWEPT_PX = 1.0
 """Standard deviation of a swept place."""
 
-COARSE_FIRST = 14
-"""Half-width from which on windows are refined in smaller images first: a step that is not half as
-long as the details are wide finds its way, and in large windows the details are large."""
-
 SUPPORT = 0.5
 """Share of a window's information that must belong to the plane found."""
 
@@ -228,7 +224,6 @@ class _Job:
         self.pair = _Pair(pencil, greys, 0)
         for size in HALF_WIDTHS if half_width_px is None else ():
             self.pair.level(_scale(size))
-            self.pair.level(2 * _scale(size))
 
     def match(self, rays: SeedRays) -> _Found:
         """Match points with texture; mark those without as `no_edge`."""
@@ -268,31 +263,31 @@ class _Job:
         places = self._places(self.pencil, rays, omega, size, self.greys)
         best, rival = (self._refined(rays, places, size, column) for column in (0, 1))
         evidence, best = _better(rays, places, best, rival)
-        best = _held(rays, places, best)
+        held = _held(rays, places, best)
         found = _Found(
-            best.omega,
-            best.std_px,
-            best.across_px,
-            best.misfit_px,
-            size.astype(float),
+            held.omega,
+            held.std_px,
+            held.across_px,
+            held.misfit_px,
+            size.astype(np.float64),
             np.zeros(len(rays), dtype=np.int64),
         )
-        seen = _seen(rays, best.omega)
+        seen = _seen(rays, held.omega)
         share = np.maximum(
             clipped_share(self.greys[0], rays.xy_px, found.half_width_px),
             clipped_share(self.greys[1], np.nan_to_num(seen), found.half_width_px),
         )
-        lost = ~np.isfinite(best.omega)
+        lost = ~np.isfinite(held.omega)
         with np.errstate(invalid="ignore"):
             for flag, where in (
                 (Flag.not_found, lost),
-                (Flag.not_converged, ~best.converged & ~lost),
+                (Flag.not_converged, ~held.converged & ~lost),
                 (Flag.ambiguous, evidence < EVIDENCE),
-                (Flag.poor_fit, (best.misfit_px > MISFIT_PX) | (best.support < SUPPORT)),
+                (Flag.poor_fit, ~_fits(best) & ~lost),
                 (Flag.aperture, best.std_px > UNSURE_PX),
                 (Flag.at_border, best.inside < COMPLETE),
                 (Flag.saturated, share > CLIPPED),
-                (Flag.inconsistent, ~lost & ~self._returns(rays, best.omega, size)),
+                (Flag.inconsistent, ~lost & ~self._returns(rays, held.omega, size)),
             ):
                 found.flags[where] |= int(flag)
         return found
@@ -327,17 +322,14 @@ class _Job:
                 continue
             some, shape, tilt = rays.select(rows), places.shape[rows], places.tilt[rows, column]
             start, scale = places.omega[rows, column], _scale(int(width))
-            scales = [2 * scale, scale] if width >= COARSE_FIRST else [scale]
-            for used in scales:
-                part = refine_windows(
-                    some,
-                    (start, tilt),
-                    shape,
-                    (int(width) // used, used),
-                    self.pair.level(used),
-                    self.epipolar_px,
-                )
-                start = np.where(part.converged, part.omega, start)
+            part = refine_windows(
+                some,
+                (start, tilt),
+                shape,
+                (int(width) // scale, scale),
+                self.pair.level(scale),
+                self.epipolar_px,
+            )
             result.put(rows, part)
         return result
 
@@ -416,18 +408,27 @@ def _better(
     return np.minimum(np.where(np.isfinite(first.omega), refined, -np.inf), coarse), first
 
 
+def _fits(refined: Refined) -> BoolArray:
+    """Mark windows most of which lie on the plane that was found."""
+    with np.errstate(invalid="ignore"):
+        return np.asarray((refined.misfit_px <= MISFIT_PX) & (refined.support >= SUPPORT))
+
+
 def _held(rays: SeedRays, places: Places, refined: Refined) -> Refined:
-    """Return to the swept place where the refinement ran away from it."""
+    """Return to the swept place where the refinement ran away from it or does not fit."""
     coarse = places.omega[:, 0]
     pace = np.full(len(rays), np.nan)
     known = np.isfinite(coarse)
     pace[known] = np.linalg.norm(rays.select(known).pace(coarse[known]), axis=1)
     nearest = np.nanmin(np.abs(places.omega - refined.omega[:, None]), axis=1, initial=np.inf)
     with np.errstate(invalid="ignore"):
-        lost = known & ~(refined.converged & (nearest * pace < FARTHEST_PX))
+        near = nearest * pace < FARTHEST_PX
+    settled = refined.converged & near & _fits(refined)
+    lost = known & ~settled
     values = {item.name: getattr(refined, item.name).copy() for item in fields(Refined)}
     values["omega"][lost], values["std_px"][lost] = coarse[lost], SWEPT_PX
-    values["across_px"][lost], values["converged"][lost] = 0.0, False
+    values["across_px"][lost] = 0.0
+    values["converged"] &= near | ~known
     return Refined(**values)
 
 

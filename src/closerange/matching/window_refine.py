@@ -15,7 +15,7 @@ from closerange.matching.window_mapping import WindowMapping
 from closerange.matching.window_planes import TILT, SeedRays
 from closerange.matching.window_scores import INDEPENDENT, shape_weights
 
-ROUNDS = 10
+ROUNDS = 12
 """Steps of Gauss-Newton; six are enough from half a pixel away."""
 
 LONGEST_PX = 0.8
@@ -28,33 +28,22 @@ LEAST_SHIFT_PX = 0.1
 """Residuals that a shift of so many px makes are not gross: what the lens and the surface do to an
 edge differs by as much from view to view."""
 
-STILL_PX = 0.004
-"""A step below it ends the iteration: a fifth of what interpolation leaves."""
+STILL_PX = 0.01
+"""A step below it ends the iteration; the next one is shorter by far."""
 
-GROSS = 2.5
-"""Residual, in standard deviations, at which a pixel has a quarter of its weight left."""
+DONE_PX = 0.05
+"""A last step longer than that is no end."""
+
 
 MODEL_PX = 0.005
 """Standard deviation that interpolation leaves in each match, px of the level: measured on
 noiseless textures with grains of one to three pixels, 0.0025 to 0.008."""
 
-LEAST_SLOPE = 0.3
-"""Least slope of the influence of a residual, on average, per weight: with Gaussian residuals 0.7."""
 
 MOST_PIXELS = 1_000_000
 """Pixels of all windows that are worked on at once."""
 
-FINER = np.array([[1, -8, 0, 8, -1]], dtype=np.float32) / 12
-"""Derivative exact to the fourth order: a plain difference halves that of fine texture."""
 
-FINER_NOISE = 130 / 144
-"""Variance that white noise of unit variance has after it."""
-
-MOST_NOISE = 0.8
-"""Largest share of the squares of derivatives that is taken for noise."""
-
-GREY_VARIANCE = 1 / 12
-"""Least variance of a difference of grey values: they are whole numbers."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -103,45 +92,6 @@ class Refined:
         """Fill in rows."""
         for item in fields(self):
             getattr(self, item.name)[rows] = getattr(part, item.name)
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Level:
-    """Both images on one level of the pyramid, prepared.
-
-    Attributes
-    ----------
-    grey, slope_x, slope_y : ndarray of float32
-        First image and its derivatives.
-    spline : ndarray of float32
-        Coefficients of the cubic B-spline through the second image (doi:10.1117/1.429926 shows
-        that it biases sub-pixel matches ten times less than the interpolating cubics).
-    noise : tuple of two ndarrays
-        Standard deviation of the noise of both.
-    """
-
-    grey: NDArray[np.float32]
-    slope_x: NDArray[np.float32]
-    slope_y: NDArray[np.float32]
-    spline: NDArray[np.float32]
-    noise: tuple[NDArray[np.float32], NDArray[np.float32]]
-
-    @classmethod
-    def of(
-        cls,
-        images: tuple[NDArray[np.float32], NDArray[np.float32]],
-        noise: tuple[NDArray[np.float32], NDArray[np.float32]],
-    ) -> Level:
-        """Prepare a pair of images."""
-        border = cv2.BORDER_REPLICATE
-        first, second = images
-        return cls(
-            first,
-            cv2.filter2D(first, -1, FINER, borderType=border),
-            cv2.filter2D(first, -1, FINER.T.copy(), borderType=border),
-            spline_filter(second, 3, output=np.float32, mode="mirror"),
-            noise,
-        )
 
 
 @dataclass(slots=True, eq=False)
@@ -312,7 +262,9 @@ class _Fit:
         state.offset[rows] += move[:, 4]
         state.moved[rows] += shift
         state.across[rows] += move[:, 5]
-        state.last[rows] = np.abs(shift)
+        # a turn of the plane moves the rim of the window, at one sigma, while its middle stays
+        rim = 0.5 * self.mapping.offset[-1, 0] * self.mapping.scale
+        state.last[rows] = np.abs(shift) + rim * np.linalg.norm(move[:, 1:3], axis=1)
 
     def _system(self, rows: IntArray, sampled: _Samples) -> _System:
         """Return the normal equations."""
@@ -354,33 +306,6 @@ class _Fit:
         slope = np.hypot(self.slopes[0][rows], self.slopes[1][rows])
         return np.asarray(slope * last[:, None])
 
-    def _noise_part(
-        self,
-        normal: FloatArray,
-        trust: FloatArray,
-        spread: FloatArray,
-        gain: FloatArray,
-        steps: FloatArray,
-    ) -> FloatArray:
-        """Return what the noise in the derivatives of the first image adds to the squares.
-
-        It tells nothing about the shift: with it left in, weak texture seems to be strong.
-        """
-        x, y = self.mapping.offset.T * float(self.mapping.scale)
-        place = np.stack([np.ones_like(x), x, y], axis=1)
-        moments = np.einsum("np,pa,pb->nab", trust, place, place)
-        # of the residuals' variance the first image has its part, both being equally noisy
-        variance = FINER_NOISE * spread**2 * gain**2 / (1 + gain**2)
-        products = variance[:, None, None] * steps.transpose(0, 2, 1) @ steps
-        part = np.zeros_like(normal)
-        part[:, :3, :3] = products[:, :1, :1] * moments
-        part[:, 5, 5] = products[:, 1, 1] * moments[:, 0, 0]
-        part[:, 5, :3] = products[:, 0, 1, None] * moments[:, 0]
-        part[:, :3, 5] = part[:, 5, :3]
-        own = [0, 1, 2, 5]
-        share = (part[:, own, own] / np.maximum(normal[:, own, own], 1e-12)).max(axis=1)
-        return np.asarray(part * (MOST_NOISE / np.maximum(share, MOST_NOISE))[:, None, None])
-
     def _judged(self) -> Refined:
         state, scale = self.state, self.mapping.scale
         rows = np.arange(len(state.omega))
@@ -417,42 +342,10 @@ class _Fit:
             misfit_px=np.where(failed, np.nan, misfit),
             likely=np.where(failed, 0.0, -0.5 * independent * np.log(share)),
             moved_px=state.moved,
-            converged=(state.last < 5 * STILL_PX * scale) & ~failed,
+            converged=(state.last < DONE_PX * scale) & ~failed,
             inside=seen,
             support=np.where(failed, 0.0, np.nan_to_num(support)),
         )
-
-    def _std(self, system: _System) -> FloatArray:
-        """Return the standard deviation of the shift, px: noise, misfit and unknown tilt."""
-        # the variance of an M-estimate: squares of the influence over its slope, and more where
-        # neighbouring residuals are alike, be it that noise was interpolated or the plane does
-        # not fit
-        weight, trust, error = system.weight, system.trust, system.error
-        far = (error / system.gross) ** 2
-        slope = np.einsum("np,np->n", weight, (1 - 3 * far) / (1 + far) ** 3)
-        slope = np.maximum(slope / np.maximum(trust.sum(axis=1), 1e-12), LEAST_SLOPE)
-        squares = np.maximum((trust**2).sum(axis=1), 1e-12)
-        count = np.maximum(trust.sum(axis=1), 1e-12) ** 2 / squares
-        variance = np.einsum("np,np->n", trust**2, error**2) / squares / slope**2
-        variance = np.maximum(variance, GREY_VARIANCE) * count / np.maximum(count - 6, 1.0)
-        inverse = np.linalg.inv(system.normal)
-        doubled = system.basis * trust[:, :, None]
-        middle = doubled.transpose(0, 2, 1) @ doubled
-        middle *= (self._alike(system) * variance)[:, None, None]
-        middle += system.prior * system.spread[:, None, None] ** 2
-        cov = inverse @ middle @ inverse
-        return np.asarray(np.sqrt(np.maximum(cov[:, 0, 0], 0.0)))
-
-    def _alike(self, system: _System) -> FloatArray:
-        """Return by how much correlation enlarges the variance of a mean of the residuals."""
-        side = int(np.sqrt(system.error.shape[1]))
-        error = (system.error * np.sqrt(system.trust)).reshape(-1, side, side)
-        own = np.maximum((error**2).sum(axis=(1, 2)), 1e-12)
-        alike = np.ones(len(own))
-        for turned in (error, error.transpose(0, 2, 1)):
-            lags = [(turned[:, lag:] * turned[:, :-lag]).sum(axis=(1, 2)) / own for lag in (1, 2)]
-            alike *= 1 + 2 * sum(np.clip(lag, 0.0, 1.0) for lag in lags)
-        return alike
 
     def _noise(self, rows: IntArray) -> FloatArray:
         """Return the variance of the difference that the noise of both images causes."""
@@ -465,59 +358,3 @@ class _Fit:
         height, width = second.shape
         u, v = np.clip(np.nan_to_num(np.rint(place)), 0, [width - 1, height - 1]).astype(int).T
         return np.asarray((state.gain[rows] * here) ** 2 + second[v, u] ** 2)
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class _Samples:
-    """Windows as the second image shows them; `steps` are those of the middle, as columns."""
-
-    values: FloatArray
-    along: FloatArray
-    across: FloatArray
-    weight: FloatArray
-    steps: FloatArray
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class _System:
-    """Normal equations of a chunk and what they are made of."""
-
-    normal: FloatArray
-    right: FloatArray
-    basis: FloatArray
-    trust: FloatArray
-    error: FloatArray
-    prior: FloatArray
-    weight: FloatArray
-    spread: FloatArray
-    gross: FloatArray
-
-
-def _gain(grey: FloatArray, values: FloatArray, weight: FloatArray) -> tuple[Any, Any]:
-    """Return gain and offset of a straight-line fit of values over grey, shape (N,) each."""
-    total = np.maximum(weight.sum(axis=1), 1e-12)
-    mean_1 = np.einsum("np,np->n", weight, grey) / total
-    mean_2 = np.einsum("np,np->n", weight, values) / total
-    apart_1, apart_2 = grey - mean_1[:, None], values - mean_2[:, None]
-    shared = np.einsum("np,np,np->n", weight, apart_1, apart_2)
-    own = np.einsum("np,np->n", weight, apart_1**2)
-    other = np.einsum("np,np->n", weight, apart_2**2)
-    # a start a pixel off has little correlation: the ratio of contrasts is the better gain
-    ratio = np.sqrt(other / np.maximum(own, 1e-12))
-    gain = np.clip(np.maximum(shared / np.maximum(own, 1e-12), 0.5 * ratio), 0.05, 20.0)
-    return gain, mean_2 - gain * mean_1
-
-
-def _spread(error: FloatArray, weight: FloatArray) -> FloatArray:
-    """Return the standard deviation of the residuals, blind to the worse half, shape (N,)."""
-    counted = weight > 0.1
-    size = np.where(counted, np.abs(error), np.nan)
-    size[~counted.any(axis=1)] = 1.0
-    spread = 1.4826 * np.nanmedian(size, axis=1)
-    return np.asarray(np.maximum(spread, np.sqrt(GREY_VARIANCE)))
-
-
-def _inverse(matrix: FloatArray) -> FloatArray:
-    """Invert 2 x 2 covariances; those of cameras that see no tilt are held fast."""
-    size = np.trace(matrix, axis1=1, axis2=2)[:, None, None]
-    return np.asarray(np.linalg.inv(matrix + np.eye(2) * np.maximum(1e-6 * size, 1e-10)))

@@ -9,7 +9,7 @@ import numpy as np
 
 from closerange.errors import GeometryError
 from closerange.geometry.arrays import FloatArray
-from closerange.geometry.least_squares import levenberg_marquardt
+from closerange.geometry.least_squares import GAIN_LIMIT, levenberg_marquardt
 from closerange.geometry.transform import RigidTransform, cross_matrix, rotation_from_vector
 from closerange.rig.camera import POSE, Camera
 from closerange.rig.camera_start import affine_starts, square_pixels
@@ -60,6 +60,7 @@ def fit_camera(
     start: Camera | None = None,
     *,
     max_iterations: int = MAX_ITERATIONS,
+    gain_limit: float = GAIN_LIMIT,
 ) -> CameraFit:
     """Estimate a camera by least squares of its (whitened) image residuals.
 
@@ -73,6 +74,8 @@ def fit_camera(
         Where to begin; found from the points without it.
     max_iterations : int, optional
         Largest number of steps from a given start.
+    gain_limit : float, optional
+        Share of the cost below which a step from a given start is not worth while.
 
     Returns
     -------
@@ -96,7 +99,9 @@ def fit_camera(
             remedy="add control points, or choose a model with fewer parameters",
         )
     if start is not None:
-        return _descend(view, free, [free], start, max_iterations=max_iterations)
+        return _descend(
+            view, free, [free], start, max_iterations=max_iterations, gain_limit=gain_limit
+        )
     return _from_scratch(view, free)
 
 
@@ -201,6 +206,7 @@ def _descend(
     start: Camera,
     *,
     max_iterations: int = MAX_ITERATIONS,
+    gain_limit: float = GAIN_LIMIT,
 ) -> CameraFit:
     """Run Levenberg-Marquardt through stages that free more and more parameters."""
     projector = Projector(view, start)
@@ -216,6 +222,7 @@ def _descend(
             np.zeros(len(stage)),
             max_iterations=max_iterations if last else 30,
             step_limit=1e-10 if last else 1e-4,
+            gain_limit=gain_limit,
             # weaker than the weakest direction of a usual rig: less would only slow it down
             damping=1e-5,
             terms=float(np.sum(seen**2)),

@@ -158,11 +158,9 @@ def _fit_normals(cameras: Sequence[Camera], discs: DiscViews, rows: NDArray[np.i
         np.subtract(whole[..., 1], ROOT_2 * x * y, out=shape[..., 1])
         np.subtract(whole[..., 2], y * y, out=shape[..., 2])
         shape *= weight[:, None, :, None]
-        shape = shape.reshape(len(rows), count, -1)
-        factor = (shape @ seen_terms[..., None])[..., 0]
-        factor /= np.maximum(np.einsum("mgk,mgk->mg", shape, shape), 1e-300)
-        shape *= factor[..., None]
-        residual: FloatArray = seen_terms[:, None] - shape
+        terms = shape.reshape(len(rows), count, -1)
+        factor = (terms @ seen_terms[..., None])[..., 0] / np.maximum(_square(terms), 1e-300)
+        residual: FloatArray = seen_terms[:, None] - factor[..., None] * terms
         return residual
 
     sphere = np.broadcast_to(_sphere(), (len(rows), _SPHERE, 3))
@@ -197,7 +195,7 @@ def _gauss_newton(miss: Callable[[FloatArray], FloatArray], normal: FloatArray) 
 
 def _square(residual: FloatArray) -> FloatArray:
     """Sum of squares over the last axis."""
-    return np.einsum("mgk,mgk->mg", residual, residual)
+    return np.asarray(np.einsum("mgk,mgk->mg", residual, residual))
 
 
 @cache

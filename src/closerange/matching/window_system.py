@@ -1,0 +1,138 @@
+"""Normal equations of the refinement of windows, and the uncertainty that follows from them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from closerange.geometry.arrays import FloatArray
+from closerange.matching.window_images import FINER_NOISE
+
+LEAST_SLOPE = 0.3
+"""Least slope of the influence of a residual, on average, per weight: 0.7 for Gaussian residuals."""
+
+MOST_NOISE = 0.8
+"""Largest share of the squares of derivatives that is taken for noise."""
+
+GREY_VARIANCE = 1 / 12
+"""Least variance of a difference of grey values: they are whole numbers."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Samples:
+    """Windows as the second image shows them; `steps` are those of the middle, as columns."""
+
+    values: FloatArray
+    along: FloatArray
+    across: FloatArray
+    weight: FloatArray
+    steps: FloatArray
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class System:
+    """Normal equations of a chunk and what they are made of."""
+
+    normal: FloatArray
+    right: FloatArray
+    basis: FloatArray
+    trust: FloatArray
+    error: FloatArray
+    prior: FloatArray
+    weight: FloatArray
+    spread: FloatArray
+    gross: FloatArray
+
+
+def gain_and_offset(grey: FloatArray, values: FloatArray, weight: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Return gain and offset of a straight-line fit of values over grey, shape (N,) each."""
+    total = np.maximum(weight.sum(axis=1), 1e-12)
+    mean_1 = np.einsum("np,np->n", weight, grey) / total
+    mean_2 = np.einsum("np,np->n", weight, values) / total
+    apart_1, apart_2 = grey - mean_1[:, None], values - mean_2[:, None]
+    shared = np.einsum("np,np,np->n", weight, apart_1, apart_2)
+    own = np.einsum("np,np->n", weight, apart_1**2)
+    other = np.einsum("np,np->n", weight, apart_2**2)
+    # a start a pixel off has little correlation: the ratio of contrasts is the better gain
+    ratio = np.sqrt(other / np.maximum(own, 1e-12))
+    gain = np.clip(np.maximum(shared / np.maximum(own, 1e-12), 0.5 * ratio), 0.05, 20.0)
+    return gain, mean_2 - gain * mean_1
+
+
+def spread(error: FloatArray, weight: FloatArray) -> FloatArray:
+    """Return the standard deviation of the residuals, blind to the worse half, shape (N,)."""
+    counted = weight > 0.1
+    size = np.where(counted, np.abs(error), np.nan)
+    size[~counted.any(axis=1)] = 1.0
+    spread = 1.4826 * np.nanmedian(size, axis=1)
+    return np.asarray(np.maximum(spread, np.sqrt(GREY_VARIANCE)))
+
+
+def inverse_covariance(matrix: FloatArray) -> FloatArray:
+    """Invert 2 x 2 covariances; those of cameras that see no tilt are held fast."""
+    size = np.trace(matrix, axis1=1, axis2=2)[:, None, None]
+    return np.asarray(np.linalg.inv(matrix + np.eye(2) * np.maximum(1e-6 * size, 1e-10)))
+
+
+def _noise_part(
+    self,
+    normal: FloatArray,
+    trust: FloatArray,
+    spread: FloatArray,
+    gain: FloatArray,
+    steps: FloatArray,
+) -> FloatArray:
+    """Return what the noise in the derivatives of the first image adds to the squares.
+
+    It tells nothing about the shift: with it left in, weak texture seems to be strong.
+    """
+    x, y = self.mapping.offset.T * float(self.mapping.scale)
+    place = np.stack([np.ones_like(x), x, y], axis=1)
+    moments = np.einsum("np,pa,pb->nab", trust, place, place)
+    # of the residuals' variance the first image has its part, both being equally noisy
+    variance = FINER_NOISE * spread**2 * gain**2 / (1 + gain**2)
+    products = variance[:, None, None] * steps.transpose(0, 2, 1) @ steps
+    part = np.zeros_like(normal)
+    part[:, :3, :3] = products[:, :1, :1] * moments
+    part[:, 5, 5] = products[:, 1, 1] * moments[:, 0, 0]
+    part[:, 5, :3] = products[:, 0, 1, None] * moments[:, 0]
+    part[:, :3, 5] = part[:, 5, :3]
+    own = [0, 1, 2, 5]
+    share = (part[:, own, own] / np.maximum(normal[:, own, own], 1e-12)).max(axis=1)
+    return np.asarray(part * (MOST_NOISE / np.maximum(share, MOST_NOISE))[:, None, None])
+
+
+
+def shift_std(system: System) -> FloatArray:
+    """Return the standard deviation of the shift, px: noise, misfit and unknown tilt."""
+    # the variance of an M-estimate: squares of the influence over its slope, and more where
+    # neighbouring residuals are alike, be it that noise was interpolated or the plane does
+    # not fit
+    weight, trust, error = system.weight, system.trust, system.error
+    far = (error / system.gross) ** 2
+    slope = np.einsum("np,np->n", weight, (1 - 3 * far) / (1 + far) ** 3)
+    slope = np.maximum(slope / np.maximum(trust.sum(axis=1), 1e-12), LEAST_SLOPE)
+    squares = np.maximum((trust**2).sum(axis=1), 1e-12)
+    count = np.maximum(trust.sum(axis=1), 1e-12) ** 2 / squares
+    variance = np.einsum("np,np->n", trust**2, error**2) / squares / slope**2
+    variance = np.maximum(variance, GREY_VARIANCE) * count / np.maximum(count - 6, 1.0)
+    inverse = np.linalg.inv(system.normal)
+    doubled = system.basis * trust[:, :, None]
+    middle = doubled.transpose(0, 2, 1) @ doubled
+    middle *= (_alike(system) * variance)[:, None, None]
+    middle += system.prior * system.spread[:, None, None] ** 2
+    cov = inverse @ middle @ inverse
+    return np.asarray(np.sqrt(np.maximum(cov[:, 0, 0], 0.0)))
+
+def _alike(system: System) -> FloatArray:
+    """Return by how much correlation enlarges the variance of a mean of the residuals."""
+    side = int(np.sqrt(system.error.shape[1]))
+    error = (system.error * np.sqrt(system.trust)).reshape(-1, side, side)
+    own = np.maximum((error**2).sum(axis=(1, 2)), 1e-12)
+    alike = np.ones(len(own))
+    for turned in (error, error.transpose(0, 2, 1)):
+        lags = [(turned[:, lag:] * turned[:, :-lag]).sum(axis=(1, 2)) / own for lag in (1, 2)]
+        alike *= 1 + 2 * sum(np.clip(lag, 0.0, 1.0) for lag in lags)
+    return alike
+
