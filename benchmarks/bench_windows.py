@@ -21,7 +21,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from closerange.features.edges import EdgePoints, find_edges
+from closerange.features.edges import find_edges
 from closerange.geometry.transform import RigidTransform
 from closerange.matching.pencil import Pencil
 from closerange.matching.window_matcher import WindowMatches, match_windows
@@ -206,7 +206,7 @@ def table(path: Path) -> list[dict[str, str]]:
 
 
 def discs(folder: Path) -> None:
-    """True centres of discs on plates, and their true places in the other view."""
+    """Match true centres of discs on plates."""
     cameras = rendered_cameras(folder)
     targets = table(folder / "targets.csv")
     key = next(name for name in targets[0] if name in {"image", "file"})
@@ -237,7 +237,7 @@ def joined(parts: Sequence[WindowMatches]) -> WindowMatches:
 
 
 def single_discs(folder: Path) -> None:
-    """The acceptance crops: one disc at 90 places, pasted into plain images."""
+    """Match the acceptance crops: one disc at 90 places, pasted into plain images."""
     cameras = rendered_cameras(folder)
     crops = {c["image"]: c for c in table(folder / "single" / "crops.csv")}
     targets = table(folder / "single" / "targets.csv")
@@ -286,7 +286,7 @@ def plane(
 
 
 def planes() -> None:
-    """Rendered textures: tilts, noise, a step between two depths; the second camera is darker."""
+    """Match rendered textures: tilts, noise, a step between two depths; the second camera is darker."""
     left, right = (
         looking_at_origin(
             name,

@@ -139,7 +139,6 @@ def find_places(
 
 def _outstanding(likely: FloatArray) -> IntArray:
     """Return the columns of up to `KEPT` places, shape (N, KEPT); -1 fills up."""
-    rows, width, shapes = likely.shape
     total = likely.sum(axis=2)
     padded = np.pad(total, ((0, 0), (1, 1)), constant_values=-np.inf)
     peak = (total >= padded[:, :-2]) & (total > padded[:, 2:]) & np.isfinite(total)
@@ -163,7 +162,6 @@ def _refined(
     tilts: FloatArray,
 ) -> tuple[FloatArray, IntArray, FloatArray]:
     """Look around places on a finer level; return places, tilts and the likelihood of shapes."""
-    rows, kept = place.shape
     known = np.isfinite(place)
     used = int(known.sum(axis=1).max(initial=1))
     place, known = place[:, :used], known[:, :used]
@@ -194,7 +192,7 @@ def _decided(
     """Choose size and shape by the evidence, and with them the best two places."""
     used = place.shape[1]
     known = np.isfinite(place)
-    point, column = np.nonzero(known)
+    point, _ = np.nonzero(known)
     seen = np.full((*place.shape, 2), np.nan)
     seen[known] = rays.second.project(rays.select(point).at(place[known]))
     sums = np.cumsum([level[:, :used] for level in levels], axis=0)

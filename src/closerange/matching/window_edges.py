@@ -13,7 +13,7 @@ from closerange.geometry.arrays import FloatArray, IntArray
 from closerange.matching.candidates import find_candidates
 from closerange.matching.evidence import turn
 from closerange.matching.pencil import Pencil
-from closerange.matching.window_planes import TILT, SeedRays
+from closerange.matching.window_planes import TILT, TILTS, SeedRays
 
 FARTHEST_SHARE = 0.15
 """Radius per image width within which edges are looked for: a face of a third of the image."""
@@ -41,9 +41,6 @@ MOST_BINS = 20_000
 
 EARNED = 0.98
 """Votes of a tilted plane count for so much."""
-
-TILTS = np.array([[a, b] for a in (0.0, -TILT, TILT) for b in (0.0, -TILT, TILT)])
-"""Hypotheses of the tilt, none first."""
 
 BIN_PX = 0.5
 """Width of the bins of the vote."""
@@ -137,9 +134,8 @@ def vote_planes(
     PlaneVotes
         One row for each point.
     """
-    nothing = PlaneVotes(
-        *(np.full(len(rays), np.nan) for _ in range(4)), np.full(len(rays), int(Flag.no_edge))
-    )
+    empty = np.full(len(rays), np.nan)
+    nothing = PlaneVotes(empty, empty, empty, empty, np.full(len(rays), int(Flag.no_edge)))
     if not len(rays) or not len(edges[0]) or not len(edges[1]):
         return nothing
     windows = _windows(rays, middle, edges[0])
@@ -151,8 +147,8 @@ def vote_planes(
         _voted(rays.select([row]), middle[row], voters, window)
         for row, window in enumerate(windows)
     ]
-    columns = [np.array(column) for column in zip(*found, strict=True)]
-    return PlaneVotes(*columns[:4], columns[4].astype(np.int64))
+    omega, std, misfit, radius, flags = (np.array(column) for column in zip(*found, strict=True))
+    return PlaneVotes(omega, std, misfit, radius, flags.astype(np.int64))
 
 
 def _windows(rays: SeedRays, middle: FloatArray, edges: EdgePoints) -> list[IntArray]:
@@ -287,8 +283,8 @@ def _fitted(
     prior[1:, 1:] = np.linalg.inv(loose + np.eye(2) * max(1e-6 * np.trace(loose), 1e-10))
     weight = std**-2
     trust, scale = np.ones(len(shift)), 1.0
-    unknown = np.zeros(3)
-    normal = prior
+    unknown: FloatArray = np.zeros(3)
+    normal: FloatArray = prior
     for _ in range(6):
         weighted = basis * (weight * trust)[:, None]
         normal = weighted.T @ basis + prior * scale

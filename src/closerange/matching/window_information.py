@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from closerange.features.grey_noise import WINDOW_PX, noise_curve
-from closerange.geometry.arrays import FloatArray, IntArray
+from closerange.geometry.arrays import BoolArray, FloatArray, IntArray
 from closerange.geometry.interpolation import bilinear
 
 HALF_WIDTHS = (5, 7, 10, 14, 20, 28, 40)
@@ -74,6 +74,10 @@ class Information:
             for number, half_width in enumerate(half_widths):
                 tensor[number, :, part] = _window_sum(product, xy_px, SIGMA_SHARE * half_width)
         return cls(tensor)
+
+    def select(self, rows: slice | BoolArray) -> Information:
+        """Keep some points."""
+        return Information(self.tensor[:, rows])
 
     def along(self, direction: FloatArray) -> FloatArray:
         """Return the information about a shift along directions in the image, shape (S, N).

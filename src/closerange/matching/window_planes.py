@@ -16,6 +16,9 @@ TILT = 0.6
 """Tangent of the tilts that are tried beside none. Halfway to the next one a window fits well
 enough for the refinement to find the rest: tilts up to 0.9, 42 degrees, are reached."""
 
+TILTS = np.array([[a, b] for a in (0.0, -TILT, TILT) for b in (0.0, -TILT, TILT)])
+"""Hypotheses: along the line between the cameras and across it; none first."""
+
 NODES = 9
 """Places on an epipolar segment at which the mapping is computed; it is linear between them."""
 
@@ -198,11 +201,10 @@ def tilt_hypotheses(rays: SeedRays, omega: FloatArray, half_width: float) -> Flo
     alone: cameras that stand close together need no hypotheses.
     """
     level = np.zeros((len(rays), 2))
-    change = rays.slope(omega, level + [TILT, 0.0]) - rays.slope(omega, level)
+    change = rays.slope(omega, level + np.array([TILT, 0.0])) - rays.slope(omega, level)
     pace = np.linalg.norm(rays.pace(omega), axis=1)
     moved = pace * np.linalg.norm(change, axis=1) * half_width
     finite = moved[np.isfinite(moved)]
     if not finite.size or np.median(finite) < 0.5:
         return np.zeros((1, 2))
-    grid = np.array([[a, b] for a in (0.0, -TILT, TILT) for b in (0.0, -TILT, TILT)])
-    return grid
+    return TILTS

@@ -3,17 +3,29 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, fields
-from typing import Any
 
-import cv2
 import numpy as np
-from numpy.typing import NDArray
-from scipy.ndimage import map_coordinates, spline_filter
+from scipy.ndimage import map_coordinates
 
 from closerange.geometry.arrays import BoolArray, FloatArray, IntArray
+from closerange.matching.window_images import Level
+from closerange.matching.window_information import SIGMA_SHARE
 from closerange.matching.window_mapping import WindowMapping
 from closerange.matching.window_planes import TILT, SeedRays
-from closerange.matching.window_scores import INDEPENDENT, shape_weights
+from closerange.matching.window_scores import INDEPENDENT, LEAST_MISFIT, shape_weights
+from closerange.matching.window_system import (
+    GREY_VARIANCE,
+    Samples,
+    System,
+    gain_and_offset,
+    inverse_covariance,
+    noise_part,
+    shift_std,
+    spread,
+)
+
+GROSS = 2.5
+"""Residual, in standard deviations, at which a pixel has a quarter of its weight left."""
 
 ROUNDS = 12
 """Steps of Gauss-Newton; six are enough from half a pixel away."""
@@ -40,10 +52,11 @@ MODEL_PX = 0.005
 noiseless textures with grains of one to three pixels, 0.0025 to 0.008."""
 
 
+LEAST_SEEN = 0.3
+"""Share of a window that both images must show for any fit."""
+
 MOST_PIXELS = 1_000_000
 """Pixels of all windows that are worked on at once."""
-
-
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -62,8 +75,6 @@ class Refined:
         Residual beyond the noise, as a shift of each pixel that would cause as much.
     likely : ndarray, shape (N,)
         Logarithm of the likelihood against a window that explains nothing.
-    moved_px : ndarray, shape (N,)
-        Way from the start.
     converged : ndarray of bool, shape (N,)
         Whether the last step was short.
     inside : ndarray, shape (N,)
@@ -77,7 +88,6 @@ class Refined:
     across_px: FloatArray
     misfit_px: FloatArray
     likely: FloatArray
-    moved_px: FloatArray
     converged: BoolArray
     inside: FloatArray
     support: FloatArray
@@ -85,8 +95,9 @@ class Refined:
     @classmethod
     def empty(cls, count: int) -> Refined:
         """Return so many failed fits; arrays may be filled in."""
-        numbers = [np.full(count, np.nan) for _ in range(6)]
-        return cls(*numbers, np.zeros(count, dtype=bool), np.zeros(count), np.zeros(count))
+        values = {item.name: np.full(count, np.nan) for item in fields(cls)}
+        values["converged"] = np.zeros(count, dtype=bool)
+        return cls(**values)
 
     def put(self, rows: IntArray, part: Refined) -> None:
         """Fill in rows."""
@@ -103,7 +114,6 @@ class _State:
     turned: FloatArray
     gain: FloatArray
     offset: FloatArray
-    moved: FloatArray
     across: FloatArray
     last: FloatArray
 
@@ -152,10 +162,9 @@ def refine_windows(
     for first in range(0, len(usable), step):
         rows = usable[first : first + step]
         mapping = WindowMapping.of(rays.select(rows), half_width, scale)
-        weights = shape_weights(mapping.offset.astype(np.float64), 0.5 * half_width)
-        fit = _Fit(mapping, weights[shape[rows]], level, (start[0][rows], start[1][rows]))
-        part = fit.run(epipolar_px)
-        result.put(rows, part)
+        weights = shape_weights(mapping.offset.astype(np.float64), SIGMA_SHARE * half_width)
+        begun = start[0][rows], start[1][rows]
+        result.put(rows, _Fit(mapping, weights[shape[rows]], level, begun, epipolar_px).run())
     return result
 
 
@@ -168,8 +177,11 @@ class _Fit:
         weight: FloatArray,
         level: Level,
         start: tuple[FloatArray, FloatArray],
+        epipolar_px: float,
     ) -> None:
         omega, tilt = start
+        self.beside_precision = epipolar_px**-2
+        self.offset = mapping.offset * float(mapping.scale)
         self.mapping, self.level, self.weight = mapping, level, weight
         rays = mapping.rays
         pace = rays.pace(omega)
@@ -182,7 +194,7 @@ class _Fit:
         self.loose = tilts @ tilts.transpose(0, 2, 1)
         height, width = level.grey.shape
         pixel = mapping.corner[:, None, :] + mapping.offset
-        self.inside = ((pixel >= 0) & (pixel < [width, height])).all(axis=2)
+        self.inside = np.asarray(((pixel >= 0) & (pixel < [width, height])).all(axis=2))
         x, y = np.clip(pixel, 0, [width - 1, height - 1]).transpose(2, 0, 1)
         self.grey = level.grey[y, x].astype(np.float64)
         self.slopes = level.slope_x[y, x], level.slope_y[y, x]
@@ -193,14 +205,12 @@ class _Fit:
             turned=np.zeros((count, 2)),
             gain=np.ones(count),
             offset=np.zeros(count),
-            moved=np.zeros(count),
             across=np.zeros(count),
             last=np.full(count, np.inf),
         )
 
-    def run(self, epipolar_px: float) -> Refined:
+    def run(self) -> Refined:
         """Iterate, then judge."""
-        self.beside_precision = epipolar_px**-2
         state = self.state
         active = np.arange(len(state.omega))
         for turn in range(ROUNDS):
@@ -210,7 +220,7 @@ class _Fit:
                 break
         return self._judged()
 
-    def _sampled(self, rows: IntArray) -> _Samples:
+    def _sampled(self, rows: IntArray) -> Samples:
         """Sample the second image, and how it changes with shifts along and across the curve."""
         mapping, state = self.mapping.select(rows), self.state
         beside = self.beside[rows]
@@ -237,7 +247,7 @@ class _Fit:
         along, across = (np.where(good, change, 0.0) for change in changes)
         middle = back.shape[1] // 2
         steps = np.stack([back[:, middle], side[:, middle]], axis=2)
-        return _Samples(
+        return Samples(
             values, along, across, np.where(good, self.weight[rows], 0.0), np.nan_to_num(steps)
         )
 
@@ -245,7 +255,7 @@ class _Fit:
         state = self.state
         sampled = self._sampled(rows)
         if with_gain:
-            state.gain[rows], state.offset[rows] = _gain(
+            state.gain[rows], state.offset[rows] = gain_and_offset(
                 self.grey[rows], sampled.values, sampled.weight
             )
         system = self._system(rows, sampled)
@@ -260,24 +270,22 @@ class _Fit:
         state.turned[rows] += move[:, 1:3]
         state.gain[rows] = np.clip(state.gain[rows] + move[:, 3], 0.05, 20.0)
         state.offset[rows] += move[:, 4]
-        state.moved[rows] += shift
         state.across[rows] += move[:, 5]
         # a turn of the plane moves the rim of the window, at one sigma, while its middle stays
-        rim = 0.5 * self.mapping.offset[-1, 0] * self.mapping.scale
+        rim = SIGMA_SHARE * self.mapping.offset[-1, 0] * self.mapping.scale
         state.last[rows] = np.abs(shift) + rim * np.linalg.norm(move[:, 1:3], axis=1)
 
-    def _system(self, rows: IntArray, sampled: _Samples) -> _System:
+    def _system(self, rows: IntArray, sampled: Samples) -> System:
         """Return the normal equations."""
         state, weight = self.state, sampled.weight
-        grey = self.grey[rows]
-        error = sampled.values - state.gain[rows, None] * grey - state.offset[rows, None]
-        spread = _spread(error, weight)
+        grey, gain = self.grey[rows], state.gain[rows, None]
+        error = sampled.values - gain * grey - state.offset[rows, None]
+        usual = spread(error, weight)
         # at a steep edge a small shift makes a large residual, and that is what is to be found
-        gross = GROSS * np.hypot(spread[:, None], self._shifted(rows) * state.gain[rows, None])
+        gross = GROSS * np.hypot(usual[:, None], self._shifted(rows) * gain)
         trust = weight / (1 + (error / gross) ** 2) ** 2
-        gain = state.gain[rows, None]
         gained = gain * sampled.along
-        x, y = self.mapping.offset.T * float(self.mapping.scale)
+        x, y = self.offset.T
         basis = np.stack(
             [gained, gained * x, gained * y, -grey, -np.ones_like(grey), gain * sampled.across],
             axis=2,
@@ -285,20 +293,23 @@ class _Fit:
         weighted = basis * trust[:, :, None]
         normal = weighted.transpose(0, 2, 1) @ basis
         right = -np.einsum("npk,np->nk", weighted, error)
-        # far from the match the residuals are no noise
+        # both images being equally noisy; far from the match the residuals are no noise
         settled = state.last[rows] < SETTLED_PX * self.mapping.scale
-        noise = self._noise_part(normal, trust, spread, gain[:, 0], sampled.steps)
-        normal -= noise * settled[:, None, None]
-        # tilt and shift beside the curve are known beforehand, though not well
-        prior = np.zeros_like(normal)
-        prior[:, 1:3, 1:3] = _inverse(self.loose[rows])
-        prior[:, 5, 5] = self.beside_precision
-        prior *= spread[:, None, None] ** 2
+        noise = usual**2 * gain[:, 0] ** 2 / (1 + gain[:, 0] ** 2) * settled
+        normal -= noise_part(normal, trust, noise, sampled.steps, self.offset)
+        prior = self._prior(rows) * usual[:, None, None] ** 2
         normal += prior
         right[:, 1:3] -= np.einsum("nij,nj->ni", prior[:, 1:3, 1:3], state.turned[rows])
         right[:, 5] -= prior[:, 5, 5] * state.across[rows]
         normal += 1e-9 * np.eye(6) * np.trace(normal, axis1=1, axis2=2)[:, None, None]
-        return _System(normal, right, basis, trust, error, prior, weight, spread, gross)
+        return System(normal, right, basis, trust, error, prior, weight, usual, gross)
+
+    def _prior(self, rows: IntArray) -> FloatArray:
+        """Return what is known beforehand of tilt and shift beside the curve, shape (N, 6, 6)."""
+        prior = np.zeros((len(rows), 6, 6))
+        prior[:, 1:3, 1:3] = inverse_covariance(self.loose[rows])
+        prior[:, 5, 5] = self.beside_precision
+        return prior
 
     def _shifted(self, rows: IntArray) -> FloatArray:
         """Return the residuals that a shift as large as the last step would make."""
@@ -310,42 +321,36 @@ class _Fit:
         state, scale = self.state, self.mapping.scale
         rows = np.arange(len(state.omega))
         sampled = self._sampled(rows)
-        values, weight = sampled.values, sampled.weight
         system = self._system(rows, sampled)
-        trust, error = system.trust, system.error
-        mass = np.maximum(trust.sum(axis=1), 1e-12)
-        count = mass**2 / np.maximum((trust**2).sum(axis=1), 1e-12)
-        free = np.maximum(count - 6, 1.0)
-        variance = np.einsum("np,np->n", trust, error**2) / mass * count / free
-        variance = np.maximum(variance, GREY_VARIANCE)
-        std = self._std(system)
-        noise = self._noise(rows)
-        # of a shift in any direction: an edge along the curve is steep only across it
-        both = system.basis[:, :, 0] ** 2 + system.basis[:, :, 5] ** 2
-        steep = np.einsum("np,np->n", trust, both) / mass
-        whole_steep = np.einsum("np,np->n", weight, both)
-        with np.errstate(divide="ignore", invalid="ignore"):
-            support = steep * mass / whole_steep
-            misfit = np.sqrt(np.maximum(variance - noise, 0.0) / steep)
-        total = np.maximum(weight.sum(axis=1), 1e-12)
-        whole = np.einsum("np,np->n", weight, error**2) / total
-        mean = np.einsum("np,np->n", weight, values) / total
-        contrast = np.einsum("np,np->n", weight, (values - mean[:, None]) ** 2) / total
-        independent = INDEPENDENT * total**2 / np.maximum((weight**2).sum(axis=1), 1e-12)
-        share = np.clip(whole / np.maximum(contrast, 1e-12), 1e-3, 1.0)
-        seen = total / self.weight.sum(axis=1)
-        failed = ~np.isfinite(state.omega) | (state.omega <= 0) | (seen < 0.3)
+        misfit, support = self._fit(system)
+        seen = sampled.weight.sum(axis=1) / self.weight.sum(axis=1)
+        failed = ~np.isfinite(state.omega) | (state.omega <= 0) | (seen < LEAST_SEEN)
+        std = np.hypot(shift_std(system), MODEL_PX * scale)
         return Refined(
             omega=np.where(failed, np.nan, state.omega),
-            std_px=np.where(failed, np.nan, np.hypot(std, MODEL_PX * scale)),
+            std_px=np.where(failed, np.nan, std),
             across_px=np.where(failed, np.nan, state.across),
             misfit_px=np.where(failed, np.nan, misfit),
-            likely=np.where(failed, 0.0, -0.5 * independent * np.log(share)),
-            moved_px=state.moved,
+            likely=np.where(failed, 0.0, _likely(sampled, system.error)),
             converged=(state.last < DONE_PX * scale) & ~failed,
             inside=seen,
             support=np.where(failed, 0.0, np.nan_to_num(support)),
         )
+
+    def _fit(self, system: System) -> tuple[FloatArray, FloatArray]:
+        """Return misfit, px, and the share of the information that supports the plane."""
+        trust = system.trust
+        mass = np.maximum(trust.sum(axis=1), 1e-12)
+        count = mass**2 / np.maximum((trust**2).sum(axis=1), 1e-12)
+        variance = np.einsum("np,np->n", trust, system.error**2) / mass
+        variance = np.maximum(variance * count / np.maximum(count - 6, 1.0), GREY_VARIANCE)
+        # of a shift in any direction: an edge along the curve is steep only across it
+        both = system.basis[:, :, 0] ** 2 + system.basis[:, :, 5] ** 2
+        steep = np.einsum("np,np->n", trust, both)
+        excess = np.maximum(variance - self._noise(np.arange(len(variance))), 0.0)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            misfit = np.sqrt(excess * mass / steep)
+            return misfit, steep / np.einsum("np,np->n", system.weight, both)
 
     def _noise(self, rows: IntArray) -> FloatArray:
         """Return the variance of the difference that the noise of both images causes."""
@@ -358,3 +363,15 @@ class _Fit:
         height, width = second.shape
         u, v = np.clip(np.nan_to_num(np.rint(place)), 0, [width - 1, height - 1]).astype(int).T
         return np.asarray((state.gain[rows] * here) ** 2 + second[v, u] ** 2)
+
+
+def _likely(sampled: Samples, error: FloatArray) -> FloatArray:
+    """Return the logarithm of the likelihood against a window that explains nothing."""
+    weight, values = sampled.weight, sampled.values
+    total = np.maximum(weight.sum(axis=1), 1e-12)
+    left = np.einsum("np,np->n", weight, error**2) / total
+    mean = np.einsum("np,np->n", weight, values) / total
+    contrast = np.einsum("np,np->n", weight, (values - mean[:, None]) ** 2) / total
+    share = np.clip(left / np.maximum(contrast, 1e-12), LEAST_MISFIT, 1.0)
+    independent = INDEPENDENT * total**2 / np.maximum((weight**2).sum(axis=1), 1e-12)
+    return np.asarray(-0.5 * independent * np.log(share))

@@ -9,13 +9,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from closerange.geometry.arrays import FloatArray, IntArray
+from closerange.matching.window_information import SIGMA_SHARE
 from closerange.matching.window_planes import SeedRays, segment_warps
 
 REACH = 5
 """Samples on each side of the seed: 11 x 11 on every level of the pyramid."""
 
-SIGMA = 2.5
-"""Standard deviation of the Gaussian weights, samples; as `SIGMA_SHARE` has it."""
+SIGMA = SIGMA_SHARE * REACH
+"""Standard deviation of the Gaussian weights, samples."""
 
 INDEPENDENT = 0.25
 """Independent values per sample: an image in focus is correlated over two pixels in x and y."""
@@ -157,7 +158,7 @@ def _unexplained(
     variance = (values * values) @ share.T - mean * mean
     # the template has a weighted mean of zero, hence no term for the mean of the values
     rho = (values @ template) / np.sqrt(np.maximum(variance, 1e-6))
-    return np.nan_to_num(1.0 - rho * np.abs(rho), nan=2.0)
+    return np.asarray(np.nan_to_num(1.0 - rho * np.abs(rho), nan=2.0), dtype=np.float32)
 
 
 def sampled(image: NDArray[np.float32], xy_px: NDArray[Any]) -> NDArray[np.float32]:

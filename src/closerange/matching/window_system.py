@@ -10,7 +10,7 @@ from closerange.geometry.arrays import FloatArray
 from closerange.matching.window_images import FINER_NOISE
 
 LEAST_SLOPE = 0.3
-"""Least slope of the influence of a residual, on average, per weight: 0.7 for Gaussian residuals."""
+"""Least mean slope of the influence of a residual, per weight: 0.7 for Gaussian residuals."""
 
 MOST_NOISE = 0.8
 """Largest share of the squares of derivatives that is taken for noise."""
@@ -32,7 +32,11 @@ class Samples:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class System:
-    """Normal equations of a chunk and what they are made of."""
+    """Normal equations of windows and what they are made of.
+
+    Unknown are the shift along the curve, its change per px in x and y, gain, offset, and the shift
+    across the curve.
+    """
 
     normal: FloatArray
     right: FloatArray
@@ -45,7 +49,9 @@ class System:
     gross: FloatArray
 
 
-def gain_and_offset(grey: FloatArray, values: FloatArray, weight: FloatArray) -> tuple[FloatArray, FloatArray]:
+def gain_and_offset(
+    grey: FloatArray, values: FloatArray, weight: FloatArray
+) -> tuple[FloatArray, FloatArray]:
     """Return gain and offset of a straight-line fit of values over grey, shape (N,) each."""
     total = np.maximum(weight.sum(axis=1), 1e-12)
     mean_1 = np.einsum("np,np->n", weight, grey) / total
@@ -65,8 +71,8 @@ def spread(error: FloatArray, weight: FloatArray) -> FloatArray:
     counted = weight > 0.1
     size = np.where(counted, np.abs(error), np.nan)
     size[~counted.any(axis=1)] = 1.0
-    spread = 1.4826 * np.nanmedian(size, axis=1)
-    return np.asarray(np.maximum(spread, np.sqrt(GREY_VARIANCE)))
+    middle = 1.4826 * np.nanmedian(size, axis=1)
+    return np.asarray(np.maximum(middle, np.sqrt(GREY_VARIANCE)))
 
 
 def inverse_covariance(matrix: FloatArray) -> FloatArray:
@@ -75,24 +81,34 @@ def inverse_covariance(matrix: FloatArray) -> FloatArray:
     return np.asarray(np.linalg.inv(matrix + np.eye(2) * np.maximum(1e-6 * size, 1e-10)))
 
 
-def _noise_part(
-    self,
+def noise_part(
     normal: FloatArray,
     trust: FloatArray,
-    spread: FloatArray,
-    gain: FloatArray,
+    variance: FloatArray,
     steps: FloatArray,
+    offset: FloatArray,
 ) -> FloatArray:
     """Return what the noise in the derivatives of the first image adds to the squares.
 
     It tells nothing about the shift: with it left in, weak texture seems to be strong.
+
+    Parameters
+    ----------
+    normal : ndarray, shape (N, 6, 6)
+        From which it is to be taken; a part of each square is left.
+    trust : ndarray, shape (N, P)
+        Weights of the pixels.
+    variance : ndarray, shape (N,)
+        Of the noise of the first image's pixels, in grey values of the second.
+    steps : ndarray, shape (N, 2, 2)
+        Columns: the steps in the first image that shifts along and across the curve make.
+    offset : ndarray, shape (P, 2)
+        Pixels from the middle of the window, px of the images.
     """
-    x, y = self.mapping.offset.T * float(self.mapping.scale)
+    x, y = offset.T
     place = np.stack([np.ones_like(x), x, y], axis=1)
     moments = np.einsum("np,pa,pb->nab", trust, place, place)
-    # of the residuals' variance the first image has its part, both being equally noisy
-    variance = FINER_NOISE * spread**2 * gain**2 / (1 + gain**2)
-    products = variance[:, None, None] * steps.transpose(0, 2, 1) @ steps
+    products = FINER_NOISE * variance[:, None, None] * steps.transpose(0, 2, 1) @ steps
     part = np.zeros_like(normal)
     part[:, :3, :3] = products[:, :1, :1] * moments
     part[:, 5, 5] = products[:, 1, 1] * moments[:, 0, 0]
@@ -101,7 +117,6 @@ def _noise_part(
     own = [0, 1, 2, 5]
     share = (part[:, own, own] / np.maximum(normal[:, own, own], 1e-12)).max(axis=1)
     return np.asarray(part * (MOST_NOISE / np.maximum(share, MOST_NOISE))[:, None, None])
-
 
 
 def shift_std(system: System) -> FloatArray:
@@ -125,14 +140,14 @@ def shift_std(system: System) -> FloatArray:
     cov = inverse @ middle @ inverse
     return np.asarray(np.sqrt(np.maximum(cov[:, 0, 0], 0.0)))
 
+
 def _alike(system: System) -> FloatArray:
     """Return by how much correlation enlarges the variance of a mean of the residuals."""
     side = int(np.sqrt(system.error.shape[1]))
     error = (system.error * np.sqrt(system.trust)).reshape(-1, side, side)
     own = np.maximum((error**2).sum(axis=(1, 2)), 1e-12)
-    alike = np.ones(len(own))
+    alike: FloatArray = np.ones(len(own))
     for turned in (error, error.transpose(0, 2, 1)):
         lags = [(turned[:, lag:] * turned[:, :-lag]).sum(axis=(1, 2)) / own for lag in (1, 2)]
-        alike *= 1 + 2 * sum(np.clip(lag, 0.0, 1.0) for lag in lags)
+        alike = alike * (1 + 2 * sum(np.clip(lag, 0.0, 1.0) for lag in lags))
     return alike
-
