@@ -286,7 +286,7 @@ def plane(
 
 
 def planes() -> None:
-    """Match rendered textures: tilts, noise, a step between two depths; the second camera is darker."""
+    """Match rendered textures: tilts, noise, two depths; the second camera is darker."""
     left, right = (
         looking_at_origin(
             name,

@@ -15,8 +15,8 @@ from closerange.matching.evidence import turn
 from closerange.matching.pencil import Pencil
 from closerange.matching.window_planes import TILT, TILTS, SeedRays
 
-FARTHEST_SHARE = 0.15
-"""Radius per image width within which edges are looked for: a face of a third of the image."""
+FARTHEST_SHARE = 0.25
+"""Radius per image width within which edges are looked for: a face of half the image."""
 
 STEEPEST = 0.3
 """Sine between edge and epipolar curve below which an edge has no vote, as for edge matches."""
@@ -160,13 +160,15 @@ def _windows(rays: SeedRays, middle: FloatArray, edges: EdgePoints) -> list[IntA
     result = []
     for xy, along in zip(rays.xy_px, back, strict=True):
         radius, chosen = NEAREST_PX, np.zeros(0, dtype=np.int64)
-        while np.isfinite(along).all() and radius < farthest:
+        while np.isfinite(along).all():
             near = np.array(tree.query_ball_point(xy, radius, return_sorted=True), dtype=np.int64)
             near = near[np.abs(edges.normal[near] @ along) > STEEPEST]
             if len(near) >= FEWEST and _gap(edges.xy_px[near] - xy) < SURE_GAP_RAD:
                 chosen = near
                 break
-            radius *= np.sqrt(2.0)
+            if radius >= farthest:
+                break
+            radius = min(radius * np.sqrt(2.0), farthest)
         result.append(chosen)
     return result
 

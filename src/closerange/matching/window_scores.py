@@ -21,8 +21,9 @@ SIGMA = SIGMA_SHARE * REACH
 INDEPENDENT = 0.25
 """Independent values per sample: an image in focus is correlated over two pixels in x and y."""
 
-LEAST_MISFIT = 1e-3
-"""Share of unexplained variance below which fits are equally good."""
+LEAST_MISFIT = 0.01
+"""Share of unexplained variance below which fits are equally good: lenses, surfaces and the light
+leave a tenth of a window's contrast."""
 
 MOST_SAMPLES = 4_000_000
 """Samples that are taken at once: 50 MB."""
