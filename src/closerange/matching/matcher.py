@@ -39,9 +39,9 @@ TEXTURE_LINES = 5.0
 """So many straight edges through that square are texture, if they go several ways: a corner of a
 part has three."""
 
-MOSTLY_TEXTURE = 0.5
-"""Share of an image's edge points on texture above which all are taken to be: a speckled plate or
-a plant has no edges of plain parts between."""
+MOSTLY_TEXTURE = 0.3
+"""Share of an image's edge points on texture above which the scene is taken for a textured one. Plain
+parts have less than a tenth there, a speckled plate or a plant two thirds and more."""
 
 TEXTURE_ONE_WAY = 0.6
 """Length of the mean of the doubled directions, from 0 (all ways) to 1 (parallel), above which
@@ -277,7 +277,10 @@ def _by_windows(matches: WindowMatches) -> _Found:
 
 
 def plain_edges(edges: EdgePoints) -> EdgePoints:
-    """Leave out the edge points of textured surfaces.
+    """Return the edges of an image of plain parts, and none of a textured scene.
+
+    Where edges of all directions lie close together every candidate finds some edge near it, while
+    a window of grey values is unlike any other: such a scene is better matched by windows.
 
     Parameters
     ----------
@@ -287,20 +290,18 @@ def plain_edges(edges: EdgePoints) -> EdgePoints:
     Returns
     -------
     EdgePoints
-        Those of plain parts.
+        All of them, or none if `MOSTLY_TEXTURE` of them lie on texture.
     """
     textured = texture_lines(edges) > TEXTURE_LINES
-    if textured.any() and textured.mean() > MOSTLY_TEXTURE:
-        textured[:] = True
-    return edges.select(~textured) if textured.any() else edges
+    mostly = textured.any() and textured.mean() > MOSTLY_TEXTURE
+    return edges.select(np.zeros(len(edges), dtype=bool)) if mostly else edges
 
 
 def texture_lines(edges: EdgePoints) -> FloatArray:
     """Return how many straight edges would make as much texture as there is around each point.
 
-    Texture is where many edges of many directions lie close together: there every candidate finds
-    some edge near it, while a window of grey values is unlike any other. Coils, teeth and
-    other parallel edges have one direction and count as none.
+    Texture is where many edges of many directions lie close together. Coils, teeth and other
+    parallel edges have one direction and count as none.
 
     Parameters
     ----------
