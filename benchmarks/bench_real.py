@@ -150,11 +150,15 @@ def chessboard(folder: Path) -> None:
     control = ControlPoints.of(target.point, target.xyz_mm)
     rig = calibrate(points, control=control, model="brown", free_poses=True)
     baseline = np.linalg.norm(rig.cameras[0].centre_mm - rig.cameras[1].centre_mm)
-    rms = np.sqrt(np.mean(np.sum(rig.residuals.residual_px**2, axis=1)))
+    square = np.sum(rig.residuals.residual_px**2, axis=1)
+    fitted = rig.residuals.fitted
+    rms, all_rms = np.sqrt(np.mean(square[fitted])), np.sqrt(np.mean(square))
     focal = ", ".join(f"{camera.matrix_px[0, 0]:.1f}" for camera in rig.cameras)
     print(
-        f"chessboard: {int(points.found.sum())} of {len(points)} corners, rms {rms:.3f} px "
-        f"(stereoCalibrate 0.217), baseline {baseline:.2f} mm (83.2), f {focal} px (532.8, 537.5)"
+        f"chessboard: {int(points.found.sum())} of {len(points)} corners, rms {rms:.3f} px of "
+        f"the {fitted.sum()} fitted, {all_rms:.3f} px with the {(~fitted).sum()} kept out "
+        f"(stereoCalibrate, of all: 0.217), baseline {baseline:.2f} mm (83.2), f {focal} px "
+        "(532.8, 537.5)"
     )
 
 

@@ -192,7 +192,7 @@ def test_a_plain_face_is_matched_by_the_edges_around_it():
     found = match_windows(PENCIL, images, edges_of(images), centre, VOLUME)
     assert found.flags.tolist() == [0, 0]
     assert found.xyz_mm[:, 2] == pytest.approx([20.0, 20.0], abs=0.05)  # measured 0.01 mm
-    assert (found.std_px < 0.05).all()
+    assert (found.std_px < 0.1).all()
     # a point of the plain ground beside it is not
     beside = LEFT.project([[45.0, 5.0, 0.0]])
     ground = match_windows(PENCIL, images, edges_of(images), beside, VOLUME)

@@ -176,16 +176,17 @@ def test_information_predicts_the_scatter_of_shifts():
 
 
 def test_sizes_follow_the_texture():
-    area = np.array(HALF_WIDTHS, float)[:, None] ** 2
-    even = np.array([[40.0, 10.0, 1.0, 0.01]]) * area
+    width = np.array(HALF_WIDTHS, float)[:, None]
+    even = np.array([[200.0, 20.0, 1.0, 0.01]]) * width**2
     chosen = chosen_sizes(even, HALF_WIDTHS)
-    # 1111 per px^2 are asked for: 25, 49, 100 ... times 40, 10, 1
-    assert [HALF_WIDTHS[k] if k >= 0 else 0 for k in chosen] == [7, 14, 40, 0]
-    # a border that comes into view at 20 px is no texture
-    rim = np.where(np.array(HALF_WIDTHS)[:, None] >= 20, 5000.0, 0.5)
-    assert HALF_WIDTHS[chosen_sizes(rim, HALF_WIDTHS)[0]] == 40  # where its half holds it too
-    rim = np.where(np.array(HALF_WIDTHS)[:, None] >= 28, 5000.0, 0.5)
+    # noise 1 / (root(info) h) px falls, 0.003 h px grows: they meet at h = root(333 / root(info))
+    assert [HALF_WIDTHS[k] if k >= 0 else 0 for k in chosen] == [5, 10, 20, 0]
+    # a border that comes into view at 28 px is no texture, unless its half holds it too
+    rim = np.where(width >= 20, 5000.0, 0.5)
+    assert HALF_WIDTHS[chosen_sizes(rim, HALF_WIDTHS)[0]] == 40
+    rim = np.where(width >= 28, 5000.0, 0.5)
     assert chosen_sizes(rim, HALF_WIDTHS)[0] == -1
+    assert chosen_sizes(even[:1] / 25 * 5.0, (5,), 0.5).tolist() == [0, 0, 0, -1]
 
 
 def test_large_windows_are_refined_in_smaller_images():

@@ -20,17 +20,14 @@ Fewer than 11 x 11 px leave nothing to judge the fit of five parameters by."""
 SIGMA_SHARE = 0.5
 """Standard deviation of the Gaussian weights per half-width: at the rim a seventh is left."""
 
-ENOUGH_PX = 0.03
-"""Standard deviation along the epipolar curve that is asked of the information. Interpolation and
-surfaces that are not plane leave about as much, and both grow with the window."""
+ENOUGH_SHARE = 0.003
+"""Standard deviation along the epipolar curve, per px of half-width, that is asked of the
+information. Interpolation leaves 0.01 to 0.03 px in windows of ten; curvature of the surface and
+what lies on another one grow with the window, and noise need not be less than they are."""
 
 CORE_SHARE = 0.125
 """Share of a window's information that the half as wide window must hold: evenly spread texture
 has a quarter there. Less means a plain surface whose border comes into view."""
-
-SIDE_SHARE = 0.1
-"""Share of a window's information that each two opposite halves must hold: else it is one edge at
-its rim."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -101,14 +98,14 @@ def noise_map(grey: NDArray[np.float32]) -> NDArray[np.float32]:
 
 
 def chosen_sizes(
-    information: FloatArray, half_widths: tuple[int, ...], enough_px: float = ENOUGH_PX
+    information: FloatArray, half_widths: tuple[int, ...], enough_px: float | None = None
 ) -> IntArray:
     """Choose the size of the structuring element of each point.
 
-    The smallest that holds enough information along the epipolar curve: noise falls with the area
-    of a window, while the part of it that lies on another surface, and the surface's own curvature,
-    grow with it. The information must not come from the rim alone (`CORE_SHARE`), else the window
-    has only just met the border of a plain surface.
+    The smallest that holds enough information along the epipolar curve: noise falls with the size
+    of a window, while what its surface is not, a plane, grows with it, and where the two are equal
+    their sum is least. The information must not come from the rim alone (`CORE_SHARE`), else the
+    window has only just met the border of a plain surface.
 
     Parameters
     ----------
@@ -117,14 +114,17 @@ def chosen_sizes(
     half_widths : tuple of int
         S half-widths, ascending.
     enough_px : float, optional
-        Standard deviation that the information must allow.
+        Standard deviation that the information must allow, instead of `ENOUGH_SHARE`.
 
     Returns
     -------
     ndarray of int, shape (N,)
         Number of the size; -1 where none holds enough texture.
     """
-    enough = information >= enough_px**-2
+    limit = ENOUGH_SHARE * np.array(half_widths, np.float64)[:, None]
+    if enough_px is not None:
+        limit = np.full_like(limit, enough_px)
+    enough = information >= limit**-2
     core = np.ones_like(enough)
     for number, half_width in enumerate(half_widths):
         inner = [k for k in range(number) if half_widths[k] <= half_width // 2]

@@ -17,7 +17,6 @@ from closerange.matching.pencil import Pencil
 from closerange.matching.search import checked_volume, inside_image
 from closerange.matching.window_images import ImagePair
 from closerange.matching.window_information import (
-    ENOUGH_PX,
     HALF_WIDTHS,
     Information,
     chosen_sizes,
@@ -184,7 +183,7 @@ def _sizes(
     back = rays.select(known).back(np.nanmedian(omega[known], axis=1))
     # the second image is as noisy as the first
     told = information.select(known).along(np.nan_to_num(back)) / 2
-    chosen = chosen_sizes(told, widths, UNSURE_PX if fixed else ENOUGH_PX)
+    chosen = chosen_sizes(told, widths, UNSURE_PX if fixed else None)
     sizes[known] = np.where(chosen >= 0, np.array(widths)[chosen], 0)
     return sizes
 

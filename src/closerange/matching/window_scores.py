@@ -130,15 +130,26 @@ def _misfits(
     filled = np.where(there, omega, spare[:, None])
     rows, columns = omega.shape
     repeated = rays.select(np.repeat(np.arange(rows), columns))
-    centre = rays.second.project(repeated.at(filled.ravel())).reshape(rows, columns, 1, 2) / scale
+    centre = rays.second.project(repeated.at(filled.ravel())) / scale
     count = np.maximum(there.sum(axis=1), 1)
     warps = segment_warps(rays, filled, count, tilts)
     misfit = np.empty((rows, columns, len(tilts), len(weights)), dtype=np.float32)
+    basis = _affine(offset)
     for number in range(len(tilts)):
-        place = offset @ warps[:, :, number].transpose(0, 1, 3, 2)
-        place += centre.astype(np.float32)
-        misfit[:, :, number] = _unexplained(sampled(images[1], place), template, share)
+        warp = warps[:, :, number].reshape(rows * columns, 4)
+        place = np.concatenate([warp, centre], axis=1, dtype=np.float32) @ basis
+        values = sampled(images[1], place.reshape(rows, columns, -1, 2))
+        misfit[:, :, number] = _unexplained(values, template, share)
     return misfit
+
+
+def _affine(offset: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Return what makes places of all samples from a warp and a centre, shape (6, 2 P)."""
+    basis = np.zeros((6, len(offset), 2), dtype=np.float32)
+    basis[0:2, :, 0] = offset.T
+    basis[2:4, :, 1] = offset.T
+    basis[4, :, 0] = basis[5, :, 1] = 1.0
+    return basis.reshape(6, -1)
 
 
 def _template(patch: NDArray[np.float32], share: NDArray[np.float32]) -> NDArray[np.float32]:

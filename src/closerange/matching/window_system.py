@@ -149,5 +149,5 @@ def _alike(system: System) -> FloatArray:
     alike: FloatArray = np.ones(len(own))
     for turned in (error, error.transpose(0, 2, 1)):
         lags = [(turned[:, lag:] * turned[:, :-lag]).sum(axis=(1, 2)) / own for lag in (1, 2)]
-        alike = alike * (1 + 2 * sum(np.clip(lag, 0.0, 1.0) for lag in lags))
+        alike = alike * np.maximum(1 + 2 * (lags[0] + lags[1]), 1.0)
     return alike
