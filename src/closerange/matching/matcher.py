@@ -40,8 +40,8 @@ TEXTURE_LINES = 5.0
 part has three."""
 
 MOSTLY_TEXTURE = 0.3
-"""Share of an image's edge points on texture above which the scene is taken for a textured one. Plain
-parts have less than a tenth there, a speckled plate or a plant two thirds and more."""
+"""Share of an image's edge points on texture above which the scene is taken for a textured one.
+Plain parts have less than a tenth there, a speckled plate or a plant two thirds and more."""
 
 TEXTURE_ONE_WAY = 0.6
 """Length of the mean of the doubled directions, from 0 (all ways) to 1 (parallel), above which
