@@ -14,6 +14,10 @@ from closerange.matching.window_scores import scores
 KEPT = 8
 """Places that are looked at more finely: the best of each shape, and the best others."""
 
+HOPELESS = 10.0
+"""Logarithm of the likelihood, a mean over all shapes, by which a place may be behind the best one
+on the levels seen so far: one of twenty thousand comes back."""
+
 NEAR = 2
 """Samples on each side of such a place that are tried on the next finer level: one of the coarser
 level."""
@@ -131,10 +135,20 @@ def find_places(
     hypothesis = tilt[rows, column]
     levels = [np.where((column >= 0)[:, :, None], likely[rows, column], -np.inf)]
     for level in range(top - 1, -1, -1):
+        place = _hopeful(place, levels)
         pair = (images[0][level], images[1][level])
         place, hypothesis, value = _refined(rays, place, pair, 1 << level, tilts)
         levels.append(value)
     return _decided(rays, place, tilts[hypothesis], levels[::-1][:TOGETHER])
+
+
+def _hopeful(place: FloatArray, levels: list[FloatArray]) -> FloatArray:
+    """Drop places that are far less likely than the best of their seed."""
+    used = place.shape[1]
+    total = np.sum([level[:, :used].mean(axis=2) for level in levels], axis=0)
+    best = total.max(axis=1, initial=-np.inf, keepdims=True)
+    with np.errstate(invalid="ignore"):
+        return np.where(best - total <= HOPELESS, place, np.nan)
 
 
 def _outstanding(likely: FloatArray) -> IntArray:
@@ -163,7 +177,7 @@ def _refined(
 ) -> tuple[FloatArray, IntArray, FloatArray]:
     """Look around places on a finer level; return places, tilts and the likelihood of shapes."""
     known = np.isfinite(place)
-    used = int(known.sum(axis=1).max(initial=1))
+    used = int(np.flatnonzero(known.any(axis=0)).max(initial=0)) + 1
     place, known = place[:, :used], known[:, :used]
     point, column = np.nonzero(known)
     step = np.full(place.shape, np.nan)

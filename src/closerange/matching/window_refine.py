@@ -52,6 +52,12 @@ MODEL_PX = 0.005
 noiseless textures with grains of one to three pixels, 0.0025 to 0.008."""
 
 
+CORE_PX = 2
+"""Pixels on each side that are the point itself: five by five are enough for a mean."""
+
+PLAIN = 4.0
+"""Squared derivatives per squared noise below which these cannot tell: noise alone makes 1."""
+
 LEAST_SEEN = 0.3
 """Share of a window that both images must show for any fit."""
 
@@ -80,7 +86,8 @@ class Refined:
     inside : ndarray, shape (N,)
         Share of the window that both images show.
     support : ndarray, shape (N,)
-        Share of the window's information that was not let go as gross.
+        Share of the window's information that was not let go as gross, or of the weight of the
+        pixels next to the point, whichever is less.
     """
 
     omega: FloatArray
@@ -338,7 +345,7 @@ class _Fit:
         )
 
     def _fit(self, system: System) -> tuple[FloatArray, FloatArray]:
-        """Return misfit, px, and the share of the information that supports the plane."""
+        """Return misfit, px, and the share of information, or of the core, that supports it."""
         trust = system.trust
         mass = np.maximum(trust.sum(axis=1), 1e-12)
         count = mass**2 / np.maximum((trust**2).sum(axis=1), 1e-12)
@@ -348,9 +355,14 @@ class _Fit:
         both = system.basis[:, :, 0] ** 2 + system.basis[:, :, 5] ** 2
         steep = np.einsum("np,np->n", trust, both)
         excess = np.maximum(variance - self._noise(np.arange(len(variance))), 0.0)
+        # the point itself must lie on the plane too, not only most of what surrounds it
+        core = np.flatnonzero(np.abs(self.mapping.offset).max(axis=1) <= CORE_PX)
+        plain = both[:, core].mean(axis=1) < PLAIN * system.spread**2
         with np.errstate(divide="ignore", invalid="ignore"):
             misfit = np.sqrt(excess * mass / steep)
-            return misfit, steep / np.einsum("np,np->n", system.weight, both)
+            support = steep / np.einsum("np,np->n", system.weight, both)
+            own = trust[:, core].sum(axis=1) / system.weight[:, core].sum(axis=1)
+        return misfit, np.where(plain, support, np.minimum(support, own))
 
     def _noise(self, rows: IntArray) -> FloatArray:
         """Return the variance of the difference that the noise of both images causes."""
