@@ -118,7 +118,8 @@ def fit_without_blunders(
     plain_px = np.inf if plain is None else _plain_px(plain)
     try:
         fit, kept = _exchange(view, fitter, _sorted_robustly(view, robust_free), trials)
-        if np.count_nonzero(~kept) <= MAX_SHARE * len(view):
+        few = np.count_nonzero(~kept) <= MAX_SHARE * len(view)
+        if few and not (plain is not None and _folded_by_noise(plain, view, kept, trials)):
             return CleanFit(fit, kept, plain_px)
     except GeometryError as error:  # too little is left to carry the parameters
         refusal = refusal or error
@@ -133,8 +134,24 @@ def _suspect(fit: CameraFit, trials: int) -> bool:
     A residual does; so do many that hide each other in a large noise; and so does a far point
     that drags the fit along until none is left, for it takes a lens that no lens is.
     """
+    return not fit.converged or _contradicted(fit, trials)
+
+
+def _contradicted(fit: CameraFit, trials: int) -> bool:
+    """Whether residuals hint at blunders: one by itself, or many in a large noise."""
     hidden = _noise(fit) > HIDDEN * _inner_noise(fit.whitened, fit.dof)
-    return hidden or not fit.converged or bool((snoop(fit) > limit(fit.dof - 2, trials)).any())
+    return hidden or bool((snoop(fit) > limit(fit.dof - 2, trials)).any())
+
+
+def _folded_by_noise(plain: CameraFit, view: View, kept: BoolArray, trials: int) -> bool:
+    """Whether noise, not a far point, made the lens of the plain fit one that no lens is.
+
+    Where that lens was the only alarm, a blunder hides behind it only if it lies far from what most
+    points agree on.
+    """
+    if _contradicted(plain, trials):
+        return False
+    return bool(consensus(view)[~kept].all())
 
 
 def consensus(view: View) -> BoolArray:
