@@ -260,8 +260,8 @@ def _explaining(
             found.append(finding)
     if not found:
         return []
-    found.sort(key=lambda finding: finding.after)
-    best = found[0]
+    best = min(found, key=lambda finding: finding.after)
+    # those that tie are named in the order of the hypotheses, whatever the last digits say
     words = [f.words for f in found if f.after**2 <= TIED * best.after**2][:NAMED]
     return [_Finding(", or ".join(words), best.before, best.after)]
 
