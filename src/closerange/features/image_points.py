@@ -100,6 +100,9 @@ class ImagePoints:
     def _require_covariances(self, name: str) -> None:
         """Refuse what is neither unknown (NaN) nor symmetric and positive definite."""
         cov: FloatArray = getattr(self, name)
+        # a table holds three of the four numbers: what is read back must be what was there
+        even = (cov + cov.transpose(0, 2, 1)) / 2
+        object.__setattr__(self, name, frozen_array(even, cov.shape, name))
         xx, xy, yx, yy = cov.reshape(-1, 4).T
         with np.errstate(invalid="ignore"):
             size = np.sqrt(xx) * np.sqrt(yy)  # of negative numbers NaN, which no comparison passes
