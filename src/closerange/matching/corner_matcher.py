@@ -10,6 +10,7 @@ import numpy as np
 from closerange.features.corners import FEWEST, Corners, find_corners
 from closerange.flags import Flag
 from closerange.geometry.arrays import FloatArray, IntArray, all_finite
+from closerange.matching.all_views import Found, along_and_across, in_all_views
 from closerange.matching.candidates import sweep_axis
 from closerange.matching.correspondences import Correspondences
 from closerange.matching.edge_matcher import EdgeMatches, match_edges, on_rays
@@ -61,40 +62,24 @@ def match_corners(
     check_in_view([view.camera for view in views], volume)
     first = views[0]
     corners = find_corners(first.pixels, first.edges)
-    shape = (len(corners), len(views))
-    xy, cov = np.full((*shape, 2), np.nan), np.full((*shape, 2, 2), np.nan)
-    flags = np.zeros(shape, dtype=np.int64)
-    mismatch = np.full(len(corners), np.nan)
-    xy[:, 0], cov[:, 0] = corners.xy_px, corners.cov_px2
-    for column, other in enumerate(views[1:], start=1):
-        rest = [view for view in views[1:] if view is not other]
-        found = _pair(first, other, rest, volume, corners)
-        xy[:, column], cov[:, column], flags[:, column] = found.xy_px, found.cov_px2, found.flags
-        mismatch = np.fmin(mismatch, found.mismatch)
-        if progress:
-            progress(column, len(views) - 1)
-    return Correspondences.of(
-        cameras=[view.camera.name for view in views],
-        point=[f"c{row}" for row in range(len(corners))],
-        placement=placement,
-        xy_px=xy,
-        cov_px2=cov,
-        mismatch=mismatch,
-        flags=flags,
+    count = len(corners)
+    seeds = Found(
+        corners.xy_px, corners.cov_px2, np.full(count, np.nan), np.zeros(count, dtype=np.int64)
     )
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class _Found:
-    xy_px: FloatArray
-    cov_px2: FloatArray
-    mismatch: FloatArray
-    flags: IntArray
+    return in_all_views(
+        views,
+        lambda other, rest: _pair(first, other, rest, volume, corners),
+        seeds,
+        cameras=[view.camera.name for view in views],
+        point=[f"c{row}" for row in range(count)],
+        placement=placement,
+        progress=progress,
+    )
 
 
 def _pair(
     first: View, second: View, rest: Sequence[View], volume_mm: FloatArray, corners: Corners
-) -> _Found:
+) -> Found:
     pencil = Pencil.of(first.camera, second.camera)
     axis = sweep_axis(pencil)
     greys = (first.pixels.astype(np.float32), second.pixels.astype(np.float32))
@@ -108,8 +93,7 @@ def _pair(
     unit = way / rate[:, None]
     along = (heights.std_mm * rate) ** 2
     across = np.maximum(0.5 * np.trace(corners.cov_px2, axis1=1, axis2=2), ACROSS_PX**2)
-    outer = unit[:, :, None] * unit[:, None, :]
-    cov = along[:, None, None] * outer + across[:, None, None] * (np.eye(2) - outer)
+    cov = along_and_across(unit, along, across)
     found = all_finite(xy_px, 1)
     flags = heights.flags.copy()
     flags[found & ~inside_image(second.camera, xy_px)] |= int(Flag.outside_image)
@@ -118,7 +102,7 @@ def _pair(
     flags[found & ~inside] |= int(Flag.outside_volume)
     flags[~found & (flags == 0)] |= int(Flag.no_edge)
     cov[~found] = np.nan
-    return _Found(xy_px, cov, heights.mismatch, flags)
+    return Found(xy_px, cov, heights.mismatch, flags)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -17,6 +17,7 @@ from closerange.features.edge_operators import edge_mask
 from closerange.features.edges import EdgePoints, find_edges
 from closerange.flags import Flag
 from closerange.geometry.arrays import BoolArray, FloatArray, IntArray, all_finite
+from closerange.matching.all_views import Found, along_and_across, in_all_views
 from closerange.matching.candidates import sweep_axis
 from closerange.matching.correspondences import Correspondences
 from closerange.matching.edge_matcher import EdgeMatches, match_edges, on_rays
@@ -181,36 +182,16 @@ def match_views(
         seeds = np.asarray(seeds_px, dtype=np.float64).reshape(-1, 2)
         seed_cov = np.full((len(seeds), 2, 2), np.nan) if seeds_cov_px2 is None else seeds_cov_px2
     count = len(seeds)
-    xy = np.full((count, len(views), 2), np.nan)
-    cov = np.full((count, len(views), 2, 2), np.nan)
-    flags = np.zeros((count, len(views)), dtype=np.int64)
-    mismatch = np.full(count, np.nan)
-    xy[:, 0], cov[:, 0] = seeds, seed_cov
-    flags[:, 0] = np.where(inside_image(first.camera, seeds), 0, int(Flag.outside_image))
-    for column, other in enumerate(views[1:], start=1):
-        rest = [view for view in views[1:] if view is not other]
-        found = _pair(first, other, rest, volume, seeds, seed_cov)
-        xy[:, column], cov[:, column], flags[:, column] = found.xy_px, found.cov_px2, found.flags
-        mismatch = np.fmin(mismatch, found.mismatch)
-        if progress:
-            progress(column, len(views) - 1)
-    return Correspondences.of(
+    outside = np.where(inside_image(first.camera, seeds), 0, int(Flag.outside_image))
+    return in_all_views(
+        views,
+        lambda other, rest: _pair(first, other, rest, volume, seeds, seed_cov),
+        Found(seeds, seed_cov, np.full(count, np.nan), outside),
         cameras=[view.camera.name for view in views],
         point=list(point) if point is not None else [f"e{row}" for row in range(count)],
         placement=placement,
-        xy_px=xy,
-        cov_px2=cov,
-        mismatch=mismatch,
-        flags=flags,
+        progress=progress,
     )
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class _Found:
-    xy_px: FloatArray
-    cov_px2: FloatArray
-    mismatch: FloatArray
-    flags: IntArray
 
 
 def _pair(
@@ -220,7 +201,7 @@ def _pair(
     volume_mm: FloatArray,
     seeds: FloatArray,
     seed_cov: FloatArray,
-) -> _Found:
+) -> Found:
     """Match by edges what lies on an edge of a plain part, by windows all else."""
     pencil = Pencil.of(first.camera, second.camera)
     greys = (first.pixels.astype(np.float32), second.pixels.astype(np.float32))
@@ -241,7 +222,7 @@ def _pair(
     return found
 
 
-def _put(found: _Found, rows: IntArray, part: _Found) -> None:
+def _put(found: Found, rows: IntArray, part: Found) -> None:
     for name in ("xy_px", "cov_px2", "mismatch", "flags"):
         getattr(found, name)[rows] = getattr(part, name)
 
@@ -252,7 +233,7 @@ def _by_edges(
     edge: IntArray,
     seeds: FloatArray,
     seed_cov: FloatArray,
-) -> _Found:
+) -> Found:
     axis = sweep_axis(pencil)
     xyz_mm = on_rays(pencil, seeds, matches.xyz_mm[edge, axis], axis)
     xy_px = pencil.second.project(xyz_mm)
@@ -261,19 +242,17 @@ def _by_edges(
     flags[lost & (flags == 0)] |= int(Flag.occluded)
     cov = _match_cov(matches, edge, seed_cov)
     cov[lost] = np.nan
-    return _Found(xy_px, cov, matches.cost[edge], flags)
+    return Found(xy_px, cov, matches.cost[edge], flags)
 
 
-def _by_windows(matches: WindowMatches) -> _Found:
+def _by_windows(matches: WindowMatches) -> Found:
     lost = ~all_finite(matches.xy_px, 1)
     flags = np.array(matches.flags)
     flags[lost & (flags == 0)] |= int(Flag.not_found)
-    way = matches.epipolar
-    outer = way[:, :, None] * way[:, None, :]
-    across = np.full(len(way), ACROSS_PX**2)
-    cov = matches.std_px[:, None, None] ** 2 * outer + across[:, None, None] * (np.eye(2) - outer)
+    across = np.full(len(lost), ACROSS_PX**2)
+    cov = along_and_across(matches.epipolar, matches.std_px**2, across)
     cov[lost] = np.nan
-    return _Found(np.array(matches.xy_px), cov, np.array(matches.cost), flags)
+    return Found(np.array(matches.xy_px), cov, np.array(matches.cost), flags)
 
 
 def plain_edges(edges: EdgePoints) -> EdgePoints:
@@ -327,9 +306,9 @@ def texture_lines(edges: EdgePoints) -> FloatArray:
     return np.where(one_way, 0.0, sums[0] / TEXTURE_WINDOW_PX)
 
 
-def _nothing(count: int) -> _Found:
+def _nothing(count: int) -> Found:
     """Return that nothing was found, to be filled in."""
-    return _Found(
+    return Found(
         np.full((count, 2), np.nan),
         np.full((count, 2, 2), np.nan),
         np.full(count, np.nan),
@@ -357,10 +336,7 @@ def _match_cov(matches: EdgeMatches, edge: IntArray, seed_cov: FloatArray) -> Fl
     total = matches.std_px[edge] ** 2
     along = np.maximum(total - own * matches.rate[edge] ** 2, OWN_SHARE**2 * total)
     across = np.maximum(own, ACROSS_PX**2)
-    way = matches.epipolar[edge]
-    outer = way[:, :, None] * way[:, None, :]
-    eye = np.eye(2) - outer
-    return np.asarray(along[:, None, None] * outer + across[:, None, None] * eye)
+    return along_and_across(matches.epipolar[edge], along, across)
 
 
 def _edge_cov(edges: EdgePoints, rows: IntArray) -> FloatArray:
