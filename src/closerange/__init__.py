@@ -45,6 +45,7 @@ if TYPE_CHECKING:
     from closerange.workflows.report import report
     from closerange.workflows.run import run
     from closerange.workflows.verify import verify
+    from closerange.workflows.volume import volume
 
 _HOME = {
     "AcceptanceReport": "verification.acceptance",
@@ -67,6 +68,7 @@ _HOME = {
     "report": "workflows.report",
     "run": "workflows.run",
     "verify": "workflows.verify",
+    "volume": "workflows.volume",
 }
 
 __all__ = [
@@ -94,6 +96,7 @@ __all__ = [
     "report",
     "run",
     "verify",
+    "volume",
 ]
 
 

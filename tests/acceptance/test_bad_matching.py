@@ -324,7 +324,7 @@ def test_two_answers_that_fit_as_well_are_never_given_unflagged(folder, run, tmp
     stripe = np.where((np.arange(320) // 6) % 2, 60.0, 180.0)
     for name in ("left", "right"):
         picture = np.full((256, 320), 60.0)
-        picture[100:150] = stripe
+        picture[100:150] = np.roll(stripe, 5 if name == "right" else 0)
         soft = cv2.GaussianBlur(picture, (0, 0), 0.7)
         folder.image(name, np.rint(soft + rng.normal(0, 1.5, soft.shape)).astype(np.uint8))
     outcome = run(*folder.match("--z", -40, 40), "-o", tmp_path / "m.csv")

@@ -15,7 +15,7 @@ from closerange.apps.cli import app
 from closerange.version import __version__
 
 DEMO = Path(str(files("closerange.workflows") / "demo_data"))
-VERBS = ("detect", "calibrate", "match", "measure", "verify", "run", "demo", "report")
+VERBS = ("detect", "calibrate", "match", "measure", "verify", "run", "demo", "report", "volume")
 HEIGHTS = ("z-50.0", "z+00.0", "z+50.0")
 SIZES = ("--image-size", "left=640x512", "--image-size", "right=640x512")
 CUBE = ("--volume", "-50", "-50", "-50", "50", "50", "50")
@@ -259,3 +259,18 @@ def test_importing_the_command_line_imports_nothing_heavy():
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout == "[]\n"
+
+
+def test_a_decision_may_be_asked_to_be_surer(chain, tmp_path):
+    folder = chain[0]
+    verify = ["verify", "single-point", folder / "positions.csv", "--truth",
+              DEMO / "verify/truth.csv", "-o", tmp_path / "r.json"]  # fmt: skip
+    limit = ("--accuracy-limit", "0.05", "0.05", "0.05")
+    command(*verify, *limit, "--confidence", "0.99")
+    stored = (tmp_path / "r.json").read_text(encoding="utf-8")
+    assert json.loads(stored)["limits"]["confidence"] == 0.99
+    for wrong in ("1", "0.4"):
+        told = summary_of(*verify, *limit, "--confidence", wrong, code=2)
+        assert "confidence is" in told["error"]["message"]
+    told = summary_of(*verify, "--confidence", "0.99", code=2)
+    assert "--accuracy-limit" in told["error"]["remedy"]

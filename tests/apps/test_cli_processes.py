@@ -49,6 +49,7 @@ def shown(tmp_path_factory):
         ("detect", ["left.csv"]),
         ("calibrate", ["rig.json"]),
         ("match", ["matches.csv"]),
+        ("volume", ["volume.svg"]),
         ("measure", ["positions.csv"]),
         ("verify", ["result.json", "report.html"]),
         ("run", ["closerange-demo/inputs/results/report.html"]),

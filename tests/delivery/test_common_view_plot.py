@@ -26,7 +26,7 @@ def _cameras(angles=(-0.3, 0.3), turn=(0.0, 0.0, 0.0), focal=1400.0):
 
 def _drawn(cameras, least=None):
     view = common_view(cameras, least=least, noise_px=0.05, nodes=17)
-    svg = draw_common_view(cameras, view, propose_volume(cameras, least=least))
+    svg = draw_common_view(cameras, view, propose_volume(cameras, least=least)).render()
     assert "nan" not in str(svg).lower()
     return ET.fromstring(str(svg))  # noqa: S314 - our own drawing
 

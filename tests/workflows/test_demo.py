@@ -122,7 +122,7 @@ def test_the_report_of_the_demonstration_shows_all_of_it(shown):
         *("How it was measured", "Single-point test", "Lengths: bars across"),
         *("Lengths: bars along", "Heights: blocks", "Heights: centroids"),
         *("Matches: blocks", "Matches: centroids"),
-        *("Predicted error in the volume", "Calibration", "Positions"),
+        *("Predicted error in the volume", "Common field of view", "Calibration", "Positions"),
         *("Image points", "Pictures with detected points", "Flags", "Versions and inputs"),
         "Glossary",
     ]

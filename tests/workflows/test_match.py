@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -10,8 +12,9 @@ from closerange.errors import InputError
 from closerange.features.image_points import ImagePoints
 from closerange.flags import Flag
 from closerange.matching.matches_table import read_matches
+from closerange.matching.volume_proposal import propose_volume
 from closerange.position.suspicion import DoubtWarning
-from closerange.workflows.match import edge_names
+from closerange.workflows.match import Wanted, edge_names, match_images
 from closerange.workflows.match_inputs import read_seeds, volume_of
 from closerange.workflows.wire_frame import neighbours, write_wire_frame
 
@@ -126,10 +129,28 @@ def test_neighbours_by_hand():
 
 def test_volumes_and_seeds_by_hand(box_scene):
     rig = box_scene.rig
-    assert volume_of(rig, None, None) is rig.volume_mm
-    lifted = volume_of(rig, (-5.0, 7.0), None)
+    pair = ("left", "right")
+    volume, origin = volume_of(rig, pair)
+    assert volume is rig.volume_mm
+    assert origin == "rig"
+    lifted, origin = volume_of(rig, pair, z_mm=(-5.0, 7.0))
     assert lifted[:, 2].tolist() == [-5.0, 7.0]
     assert np.isinf(lifted[:, :2]).all()
-    assert volume_of(rig, None, [1, 2, 3, 4, 5, 6]).tolist() == [[1, 2, 3], [4, 5, 6]]
+    assert origin == "stated"
+    stated, origin = volume_of(rig, pair, volume_mm=[1, 2, 3, 4, 5, 6])
+    assert stated.tolist() == [[1, 2, 3], [4, 5, 6]]
+    assert origin == "stated"
     lost = ImagePoints.of(camera="left", point=["a", "b"], xy_px=[[1, 2], [np.nan, np.nan]])
     assert read_seeds(lost, {"left": 1}, None).flags.tolist() == [0, Flag.not_found]
+
+
+def test_a_flat_volume_of_the_rig_is_replaced_by_a_proposal(box_scene, frames, matches):
+    """Control points in one plane leave no room for a part."""
+    low, high = box_scene.rig.volume_mm.copy()
+    low[2] = high[2] = 0.0
+    flat = replace(box_scene.rig, volume_mm=[low, high])
+    matched = match_images(flat, frames, Wanted())
+    assert matched.volume_origin == "proposed"
+    np.testing.assert_array_equal(matched.volume_mm, propose_volume(flat))
+    # the proposal is larger than the rig's own volume: a few points find a second answer
+    assert matched.matches.clean.sum() > 0.8 * matches.clean.sum()

@@ -17,7 +17,7 @@ from closerange.errors import DetectionError, FileError
 from closerange.images.frame import Frame
 from closerange.rig.rig_file import write_rig
 from closerange.settings import read_settings
-from closerange.workflows.match import match_images
+from closerange.workflows.match import Wanted, match_images
 from closerange.workflows.match_overlay import write_match_pictures
 from closerange.workflows.match_scene import centroids_of, match_scene
 from closerange.workflows.report import report
@@ -160,7 +160,7 @@ truth = "blocks/parts.csv"
 
 @pytest.fixture(scope="module")
 def matched(part, box_scene):
-    return match_images(box_scene.rig, named(part))
+    return match_images(box_scene.rig, named(part), Wanted())
 
 
 def test_pictures_are_written_into_a_new_folder(part, box_scene, matched, tmp_path):

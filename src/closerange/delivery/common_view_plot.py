@@ -6,23 +6,11 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from markupsafe import Markup
 from numpy.typing import ArrayLike
 
-from closerange.delivery.svg import (
-    AXIS_COLOURS,
-    BLUE,
-    FULL_WIDTH,
-    GREEN,
-    PURPLE,
-    RULE,
-    SOFT,
-    Drawing,
-    Point,
-    nice_step,
-    tick_text,
-    ticks,
-)
+from closerange.delivery.canvas import Canvas
+from closerange.delivery.flat_view import HEIGHT, Window, draw_frame, inside_frame
+from closerange.delivery.svg import BLUE, FULL_WIDTH, GREEN, INK, PURPLE, Point
 from closerange.delivery.wording import fixed, short_length
 from closerange.geometry.arrays import BoolArray, FloatArray
 from closerange.matching.common_view import (
@@ -39,59 +27,21 @@ _SECTION_NODES = 121
 """Nodes along each side of a section: one every two drawing units, so that edges look straight."""
 
 _BEYOND = 0.35
-"""The lower row shows this much of the volume's sides beyond the volume, and the fields end this
-much of its depth behind it."""
+"""The fields of the upper row end this much of the volume's depth behind it."""
 
-_HEIGHT = 280.0
-_LEFT, _RIGHT, _TOP, _BOTTOM = 44.0, 10.0, 40.0, 34.0
+_AROUND = 0.55
+"""The lower row shows this much of the volume's sides around it: room for the errors beside it."""
 
+_LINE = 14.0
+"""Height of a line of text in drawing units."""
 
-@dataclass(frozen=True, slots=True, eq=False)
-class _Window:
-    """A flat view of the world: one axis to the right, the depth upwards or downwards.
+_AIR = 0.13
+"""Room around the cameras in the upper row, for their names, as a share of the picture."""
 
-    `low` and `high` are its limits along the two axes in mm, `corner` the upper left corner of
-    its frame and `size` the frame's width and height in drawing units.
-    """
+_FARTHEST = 1.0
+"""A calibrated volume is shown as far as it reaches this many sides beyond the proposed one."""
 
-    axes: tuple[int, int]
-    low: FloatArray
-    high: FloatArray
-    corner: Point
-    size: Point
-    up: float
-
-    @classmethod
-    def around(
-        cls, xyz_mm: FloatArray, axes: tuple[int, int], *, corner: Point, up: float, air: float
-    ) -> _Window:
-        """Fit points with air around; equal scales show more along one axis."""
-        size = (FULL_WIDTH / 2 - _LEFT - _RIGHT, _HEIGHT - _TOP - _BOTTOM)
-        flat = xyz_mm[:, axes]
-        low, high = flat.min(axis=0), flat.max(axis=0)
-        room = air * float((high - low).max()) or 1.0
-        span = high - low + 2 * room
-        spare = np.array(size) * float((span / size).max()) - span
-        low, high = low - room - spare / 2, high + room + spare / 2
-        return cls(axes, low, high, (corner[0] + _LEFT, corner[1] + _TOP), size, up)
-
-    def at(self, across: float, depth: float) -> Point:
-        """Return drawing units of a place."""
-        scale = self.size[0] / float(self.high[0] - self.low[0])
-        down = self.high[1] - depth if self.up > 0 else depth - self.low[1]
-        return (
-            float(self.corner[0] + scale * (across - self.low[0])),
-            float(self.corner[1] + scale * down),
-        )
-
-    def of(self, xyz_mm: FloatArray) -> Point:
-        """Return drawing units of a world point."""
-        return self.at(float(xyz_mm[self.axes[0]]), float(xyz_mm[self.axes[1]]))
-
-    @property
-    def bottom(self) -> float:
-        """Lower end of the frame in drawing units."""
-        return self.corner[1] + self.size[1]
+_DASH = 5.0
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -102,7 +52,13 @@ class _Field:
     least: int
 
 
-def draw_common_view(cameras: Sequence[Camera], view: CommonView, volume_mm: ArrayLike) -> Markup:
+def draw_common_view(
+    cameras: Sequence[Camera],
+    view: CommonView,
+    volume_mm: ArrayLike,
+    *,
+    calibrated_mm: ArrayLike | None = None,
+) -> Canvas:
     """Draw cameras with their common field, the same with parallel axes, and a volume within.
 
     Parameters
@@ -112,91 +68,106 @@ def draw_common_view(cameras: Sequence[Camera], view: CommonView, volume_mm: Arr
     view : CommonView
         Their common view.
     volume_mm : array_like, shape (2, 3)
-        Measuring volume, proposed or in use.
+        Measuring volume, as a rule the proposed one.
+    calibrated_mm : array_like, shape (2, 3), optional
+        Another volume, to be compared with it.
 
     Returns
     -------
-    Markup
-        Inline SVG, as wide as the page. Above: the cameras as they stand (Fig. 5.2) and turned
-        until their axes are parallel (Fig. 5.1). Below: sections of the common field through the
-        middle of the volume, along either axis across the depth.
+    Canvas
+        As wide as the page. Above: the cameras as they stand (Fig. 5.2) and turned until their
+        axes are parallel (Fig. 5.1). Below: sections of the common field through the middle of
+        the volume, along either axis across the depth.
     """
     volume = np.asarray(volume_mm, np.float64)
-    middle = volume.mean(axis=0)
+    other = None if calibrated_mm is None else np.asarray(calibrated_mm, np.float64)
     sides = " x ".join(_short(side) for side in volume[1] - volume[0])
-    drawing = Drawing(
+    drawing = Canvas(
         FULL_WIDTH,
-        2 * _HEIGHT + 26,
+        2 * HEIGHT + 42,
         "Common field of view",
         f"{len(cameras)} cameras and a volume of {sides} mm in what {view.least} of them see",
     )
     up = 1.0 if float(mean_direction(cameras)[view.depth_axis]) < 0 else -1.0
-    across = [axis for axis in range(3) if axis != view.depth_axis]
-    centres = np.stack([camera.centre_mm for camera in cameras])
-    widest = max(across, key=lambda axis: float(np.ptp(centres[:, axis])))
+    picture = _Picture(drawing, view, volume, other, up)
     fields = (_Field(tuple(cameras), view.least), _Field(parallel_axes(cameras), view.least))
-    far = _far(cameras, volume)
+    _draw_cameras(picture, fields)
+    across = [axis for axis in range(3) if axis != view.depth_axis]
+    for column, axis in enumerate(across):
+        _section(picture, fields[0], axis, corner=(column * FULL_WIDTH / 2, HEIGHT))
+    _key(picture)
+    return drawing
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Picture:
+    """What is drawn, where to, and which way along the depth is up."""
+
+    drawing: Canvas
+    view: CommonView
+    volume: FloatArray
+    calibrated: FloatArray | None
+    up: float
+
+
+def _draw_cameras(picture: _Picture, fields: tuple[_Field, _Field]) -> None:
+    """Draw the upper row: the cameras as they stand, and with parallel axes."""
+    drawing, volume, depth = picture.drawing, picture.volume, picture.view.depth_axis
+    middle = volume.mean(axis=0)
+    centres = np.stack([camera.centre_mm for camera in fields[0].cameras])
+    across = (axis for axis in range(3) if axis != depth)
+    widest = max(across, key=lambda axis: float(np.ptp(centres[:, axis])))
+    far = _far(fields[0].cameras, volume)
     frusta = [[_frustum(camera, field, far) for camera in field.cameras] for field in fields]
     everything = np.concatenate([volume, *(frustum for group in frusta for frustum in group)])
     for column, (field, words) in enumerate(
         zip(fields, ("as they stand", "with parallel axes"), strict=True)
     ):
-        window = _Window.around(
+        window = Window.around(
             everything,
-            (widest, view.depth_axis),
+            (widest, depth),
             corner=(column * FULL_WIDTH / 2, 0),
-            up=up,
-            air=0.09,  # room for the cameras' names
+            up=picture.up,
+            air=_AIR,
         )
-        shares = shared_field(field.cameras, middle, least=view.least)
+        shares = shared_field(field.cameras, middle, least=field.least)
         detail = f"shared part of the images: {_percents(shares)}"
-        _frame(drawing, window, f"Cameras {words}", detail)
+        draw_frame(drawing, window, f"Cameras {words}", detail)
         _common(drawing, window, field, middle, far=far)
-        _box(drawing, window, volume)
+        _boxes(picture, window)
         for camera, frustum in zip(field.cameras, frusta[column], strict=True):
             _camera(drawing, window, camera, frustum)
-    for column, axis in enumerate(across):
-        corner = (column * FULL_WIDTH / 2, _HEIGHT)
-        _section(drawing, fields[0], view, volume, axis, corner=corner, up=up)
-    _key(drawing, view)
-    return drawing.render()
 
 
-def _section(
-    drawing: Drawing,
-    field: _Field,
-    view: CommonView,
-    volume: FloatArray,
-    axis: int,
-    *,
-    corner: Point,
-    up: float,
-) -> None:
+def _section(picture: _Picture, field: _Field, axis: int, *, corner: Point) -> None:
     """Draw the common field around the volume, cut through the volume's middle."""
-    beyond = _BEYOND * (volume[1] - volume[0])
-    window = _Window.around(
-        np.stack([volume[0] - beyond, volume[1] + beyond]),
-        (axis, view.depth_axis),
-        corner=corner,
-        up=up,
-        air=0.0,
+    drawing, volume, depth_axis = picture.drawing, picture.volume, picture.view.depth_axis
+    size = volume[1] - volume[0]
+    shown = [volume[0] - _AROUND * size, volume[1] + _AROUND * size]
+    if picture.calibrated is not None:
+        limits = volume[0] - _FARTHEST * size, volume[1] + _FARTHEST * size
+        shown += [np.clip(wall, *limits) for wall in picture.calibrated]
+    window = Window.around(
+        np.stack(shown), (axis, depth_axis), corner=corner, up=picture.up, air=0.02
     )
     middle = volume.mean(axis=0)
-    names, cut = "XYZ", 3 - axis - view.depth_axis
-    size = f"{_short(volume[1, axis] - volume[0, axis])} mm in {names[axis]}"
-    depth = f"{_short(volume[1, view.depth_axis] - volume[0, view.depth_axis])} mm"
-    _frame(
+    names, cut = "XYZ", 3 - axis - depth_axis
+    draw_frame(
         drawing,
         window,
         f"Section at {names[cut]} = {_short(middle[cut])} mm",
-        f"volume: {size}, {depth} in {names[view.depth_axis]}",
+        f"volume: {_short(size[axis])} mm in {names[axis]}, {_short(size[depth_axis])} mm in "
+        f"{names[depth_axis]}",
     )
     _common(drawing, window, field, middle)
-    _box(drawing, window, volume)
+    _boxes(picture, window)
     beside = window.of(volume[1])[0] + 6
-    for level, std in _depth_errors(field, view, volume):
+    errors = _depth_errors(field, picture.view, volume)
+    if abs(window.of(volume[1])[1] - window.of(volume[0])[1]) < 2 * _LINE:
+        errors = errors[1:2]  # a thin volume: there is room for one line
+    for level, std in errors:
         _, y = window.at(float(middle[axis]), level)
-        text = f"{names[view.depth_axis]} ± {short_length(std)}"
+        text = f"{names[depth_axis]} ± {short_length(std)}"
         drawing.text((beside, y + 4), text, fill=PURPLE)
 
 
@@ -232,7 +203,7 @@ def _frustum(camera: Camera, field: _Field, far: float) -> FloatArray:
     return np.concatenate([camera.centre_mm[None], ends])
 
 
-def _camera(drawing: Drawing, window: _Window, camera: Camera, frustum: FloatArray) -> None:
+def _camera(drawing: Canvas, window: Window, camera: Camera, frustum: FloatArray) -> None:
     """Draw a camera's name and its field as the outline of its pyramid."""
     points = [window.of(point) for point in frustum]
     outline = _hull(points)
@@ -267,7 +238,7 @@ def _turn(a: Point, b: Point, c: Point) -> float:
 
 
 def _common(
-    drawing: Drawing, window: _Window, field: _Field, middle: FloatArray, *, far: float = np.inf
+    drawing: Canvas, window: Window, field: _Field, middle: FloatArray, *, far: float = np.inf
 ) -> None:
     """Fill what enough cameras see of the plane of the drawing through the volume's middle.
 
@@ -297,14 +268,7 @@ def _common(
         left, right = (np.concatenate([side[:1], side, side[-1:]]) for side in (left, right))
         outline = [window.at(*place) for place in zip(left, z, strict=True)]
         outline += [window.at(*place) for place in zip(right[::-1], z[::-1], strict=True)]
-        drawing.path(_inside_frame(window, outline), closed=True, fill=GREEN, fill_opacity="0.28")
-
-
-def _inside_frame(window: _Window, outline: Sequence[Point]) -> list[Point]:
-    """Move points that lie half a node outside onto the frame."""
-    left, top = window.corner
-    right, bottom = left + window.size[0], window.bottom
-    return [(min(max(x, left), right), min(max(y, top), bottom)) for x, y in outline]
+        drawing.path(inside_frame(window, outline), closed=True, fill=GREEN, fill_opacity="0.28")
 
 
 def _pieces(seen: BoolArray) -> list[list[tuple[int, int, int]]]:
@@ -324,69 +288,50 @@ def _pieces(seen: BoolArray) -> list[list[tuple[int, int, int]]]:
     return done + open_pieces
 
 
-def _box(drawing: Drawing, window: _Window, volume: FloatArray) -> None:
-    """Draw the outline of the volume."""
+def _boxes(picture: _Picture, window: Window) -> None:
+    """Draw the outlines of the volumes; what is only compared with is dashed."""
+    drawing = picture.drawing
+    if picture.calibrated is not None:
+        drawing.segments(_dashes(_outline(window, picture.calibrated)), INK, 1.2)
+    drawing.path(_outline(window, picture.volume), closed=True, stroke=PURPLE, stroke_width=1.3)
+
+
+def _outline(window: Window, volume: FloatArray) -> list[Point]:
+    """Return the corners of a box in the drawing, cut at the frame."""
     (left, front), (right, back) = volume[:, window.axes].tolist()
     corners = ((left, front), (right, front), (right, back), (left, back))
-    drawing.path(
-        [window.at(*corner) for corner in corners], closed=True, stroke=PURPLE, stroke_width=1.3
-    )
+    return inside_frame(window, [window.at(*corner) for corner in corners])
 
 
-def _frame(drawing: Drawing, window: _Window, title: str, detail: str) -> None:
-    """Draw titles, grid lines and ticks in mm, and the frame."""
-    left, top = window.corner
-    drawing.text((left, top - 24), title, font_weight="bold")
-    drawing.text((left, top - 9), detail, fill=SOFT)
-    for place in (0, 1):
-        low, high = float(window.low[place]), float(window.high[place])
-        count = max(2, min(6, int(window.size[place] / 44)))
-        step = nice_step(high - low, count)
-        for value in ticks(low, high, count):
-            text = tick_text(value, step)
-            if place == 0:
-                x, _ = window.at(value, float(window.low[1]))
-                drawing.line((x, top), (x, window.bottom), RULE, stroke_width=0.6)
-                drawing.text((x, window.bottom + 13), text, text_anchor="middle", font_size=10)
-            else:
-                _, y = window.at(float(window.low[0]), value)
-                drawing.line((left, y), (left + window.size[0], y), RULE, stroke_width=0.6)
-                drawing.text((left - 4, y + 3.5), text, text_anchor="end", font_size=10)
-    drawing.add(
-        "rect",
-        x=left,
-        y=top,
-        width=window.size[0],
-        height=window.size[1],
-        fill="none",
-        stroke=SOFT,
-        stroke_width=0.7,
-    )
-    across, deep = window.axes
-    middle = left + window.size[0] / 2
-    bold: dict[str, str | float] = {"font_weight": "bold"}
-    drawing.text(
-        (middle, window.bottom + 27),
-        f"{'XYZ'[across]} [mm]",
-        text_anchor="middle",
-        fill=AXIS_COLOURS[across],
-        **bold,
-    )
-    drawing.text((left - 40, top - 9), f"{'XYZ'[deep]} [mm]", fill=AXIS_COLOURS[deep], **bold)
+def _dashes(outline: Sequence[Point]) -> list[tuple[Point, Point]]:
+    """Divide the sides of an outline into dashes that begin and end at its corners."""
+    pairs: list[tuple[Point, Point]] = []
+    for start, end in zip(outline, [*outline[1:], outline[0]], strict=True):
+        a, way = np.array(start), np.subtract(end, start)
+        count = max(1, round((float(np.linalg.norm(way)) / _DASH - 1) / 2))
+        steps = np.arange(count + 1)[:, None] * 2 / (2 * count + 1)
+        ends = np.stack([a + steps * way, a + (steps + 1 / (2 * count + 1)) * way], axis=1)
+        pairs += [((float(p[0]), float(p[1])), (float(q[0]), float(q[1]))) for p, q in ends]
+    return pairs
 
 
-def _key(drawing: Drawing, view: CommonView) -> None:
+def _key(picture: _Picture) -> None:
     """Write the legend below the pictures."""
-    x, y = 12.0, drawing.height - 12
-    entries = (
+    drawing, view = picture.drawing, picture.view
+    x, y = 12.0, drawing.height - 28
+    several = picture.calibrated is not None
+    entries = [
         ("camera and its field", BLUE),
         (f"seen by {view.least} cameras", GREEN),
-        (f"volume; ± is one standard deviation for {fixed(view.noise_px, 3)} px", PURPLE),
-    )
+        ("proposed volume" if several else "volume", PURPLE),
+        *([("calibrated volume", INK)] if several else []),
+    ]
     for label, colour in entries:
         drawing.dot((x, y), 3.5, colour)
         drawing.text((x + 8, y + 4), label)
         x += 26 + 5.6 * len(label)  # a letter is about half as wide as high
+    text = f"±: one standard deviation of a position for {fixed(view.noise_px, 3)} px in the images"
+    drawing.text((8.5, y + 20), text)
 
 
 def _percents(shares: FloatArray) -> str:

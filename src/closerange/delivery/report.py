@@ -11,6 +11,7 @@ from markupsafe import Markup, escape
 from closerange.delivery.answers import answers
 from closerange.delivery.calibration_section import calibration_section
 from closerange.delivery.check_sections import check_sections
+from closerange.delivery.common_view_section import common_view_section
 from closerange.delivery.excerpts import documents_of
 from closerange.delivery.facts import provenance_section
 from closerange.delivery.figures_table import figures_table
@@ -30,6 +31,7 @@ from closerange.delivery.table_sections import points_section, positions_section
 from closerange.delivery.wording import printed
 from closerange.features.image_points import ImagePoints
 from closerange.matching.correspondences import Correspondences
+from closerange.matching.proposed_volume import VolumeProposal
 from closerange.position.positions import Positions
 from closerange.rig.rig import Rig
 from closerange.verification.error_map import ErrorMap
@@ -47,6 +49,7 @@ def render_report(  # noqa: PLR0913 - each argument is one thing that a report m
     scenes: ScenePictures | Mapping[str, ScenePictures] | None = None,
     checks: Sequence[object] = (),
     error_map: ErrorMap | None = None,
+    proposal: VolumeProposal | None = None,
     provenance: Mapping[str, Any] | None = None,
     notes: Sequence[str] = (),
     headline: str | None = None,
@@ -74,6 +77,8 @@ def render_report(  # noqa: PLR0913 - each argument is one thing that a report m
         their stored documents.
     error_map : ErrorMap, optional
         Predicted error in the volume.
+    proposal : VolumeProposal, optional
+        What the cameras see in common, and a measuring volume in it.
     provenance : mapping, optional
         Versions, options, input hashes: JSON-ready.
     notes : sequence of str, optional
@@ -97,6 +102,7 @@ def render_report(  # noqa: PLR0913 - each argument is one thing that a report m
         scenes={"": scenes} if isinstance(scenes, ScenePictures) else scenes or {},
         checks=documents_of(checks),
         error_map=error_map,
+        proposal=proposal,
         provenance=provenance or {},
         notes=tuple(notes),
         headline=headline,
@@ -139,6 +145,7 @@ def _sections(contents: Contents) -> list[Section]:
         *check_sections(contents.checks),
         *match_sections(contents),
         prediction_section(contents),
+        common_view_section(contents),
         calibration_section(contents),
         positions_section(contents),
         points_section(contents),

@@ -12,6 +12,7 @@ from closerange.delivery.match_pictures import ScenePictures
 from closerange.delivery.overlays import Overlay
 from closerange.features.image_points import ImagePoints
 from closerange.matching.correspondences import Correspondences
+from closerange.matching.proposed_volume import VolumeProposal
 from closerange.position.positions import Positions
 from closerange.rig.rig import Rig
 from closerange.verification.error_map import ErrorMap
@@ -41,6 +42,8 @@ class Contents:
         Documents of verification results, each with its ``kind``.
     error_map : ErrorMap or None
         Predicted error in the volume.
+    proposal : VolumeProposal or None
+        What the cameras see in common.
     provenance : mapping
         Versions, options and input hashes: JSON-ready.
     notes : sequence of str
@@ -58,6 +61,7 @@ class Contents:
     scenes: Mapping[str, ScenePictures] = field(default_factory=dict)
     checks: tuple[Mapping[str, Any], ...] = ()
     error_map: ErrorMap | None = None
+    proposal: VolumeProposal | None = None
     provenance: Mapping[str, Any] = field(default_factory=dict)
     notes: Sequence[str] = ()
     headline: str | None = None

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -12,7 +12,7 @@ from closerange.flags import Flag
 from closerange.geometry.arrays import BoolArray, FloatArray, IntArray, all_finite
 from closerange.geometry.intersection import widest_angle
 from closerange.matching.segment_clipping import SecondView
-from closerange.matching.sight import SightLines, inside_image
+from closerange.matching.sight import SightLines, inside_image, sight_line
 from closerange.rig.camera import Camera
 from closerange.rig.rig import Rig
 
@@ -117,6 +117,7 @@ def field_grid(
     least: int,
     margin_px: float,
     angle_rad: float = MIN_ANGLE_RAD,
+    within_mm: FloatArray | None = None,
 ) -> ViewGrid:
     """Lay a grid around all that enough cameras see.
 
@@ -126,6 +127,8 @@ def field_grid(
         As in `lay_grid`.
     angle_rad : float, optional
         Leave out what is so far away that rays cannot cross at this angle.
+    within_mm : ndarray, shape (2, 3), optional
+        Leave out what lies outside of this box; infinite on axes without limits.
 
     Returns
     -------
@@ -137,7 +140,7 @@ def field_grid(
     GeometryError
         If there is no place that enough cameras see under a usable angle.
     """
-    ends, middle = _shared_rays(cameras, least, angle_rad)
+    ends, middle = _shared_rays(cameras, least, angle_rad, within_mm)
     box = np.stack([ends.min(axis=0), ends.max(axis=0)])
     half = (box[1] - box[0]) / 2
     grid = lay_grid(cameras, box, nodes=nodes, least=least, margin_px=margin_px)
@@ -147,14 +150,20 @@ def field_grid(
         half = half / 2
         box = np.stack([middle - half, middle + half])
         grid = lay_grid(cameras, box, nodes=nodes, least=least, margin_px=margin_px)
-    raise _no_common_view(cameras, least)
+    raise _no_common_view(cameras, least, within_mm)
 
 
-def ray_fan(camera: Camera, reach_mm: float) -> SightLines:
-    """Return rays through a grid of pixels, corners included, from a camera up to a distance."""
+def ray_fan(camera: Camera, reach_mm: float, within_mm: FloatArray | None = None) -> SightLines:
+    """Return rays through a grid of pixels, corners included, from a camera up to a distance.
+
+    Of each ray the part within a box is kept, if one is given.
+    """
     width, height = camera.size_px
     across, down = (np.linspace(-0.5, side - 0.5, _PIXELS) for side in (width, height))
     pixels = np.stack(np.meshgrid(across, down), axis=-1).reshape(-1, 2)
+    if within_mm is not None:
+        lines = sight_line(camera, pixels, within_mm)
+        return replace(lines, far_mm=np.minimum(lines.far_mm, reach_mm))
     direction = camera.directions(pixels)
     known = all_finite(direction, 1)
     return SightLines(
@@ -200,7 +209,7 @@ def checked_cameras(
     if not 2 <= count <= len(cameras):
         raise InputError(
             f"{count} cameras of {len(cameras)} must see a place",
-            remedy=f"ask for 2 to {len(cameras)}",
+            remedy=f"ask for 2 to {len(cameras)}" if len(cameras) > 2 else "both must, of a pair",
         )
     smallest = min(min(camera.size_px) for camera in cameras)
     if not 0 <= margin_px < smallest / 2:
@@ -220,7 +229,7 @@ def pixel_grid(camera: Camera) -> FloatArray:
 
 
 def _shared_rays(
-    cameras: Sequence[Camera], least: int, angle_rad: float
+    cameras: Sequence[Camera], least: int, angle_rad: float, within_mm: FloatArray | None
 ) -> tuple[FloatArray, FloatArray]:
     """Return the ends (M, 3) of all pieces of rays that enough cameras see, and one inner point.
 
@@ -239,7 +248,7 @@ def _shared_rays(
     views = [SecondView(camera) for camera in cameras]
     ends, middles, lengths = [], [], []
     for index, camera in enumerate(cameras):
-        fan = ray_fan(camera, reach)
+        fan = ray_fan(camera, reach, within_mm)
         others = [view.clip(fan) for place, view in enumerate(views) if place != index]
         near = np.stack([segments.near_mm for segments in others], axis=1)
         far = np.stack([segments.far_mm for segments in others], axis=1)
@@ -254,17 +263,22 @@ def _shared_rays(
         lengths.append(high - low)
     length = np.concatenate(lengths)
     if not length.size:
-        raise _no_common_view(cameras, least)
+        raise _no_common_view(cameras, least, within_mm)
     return np.concatenate(ends), np.concatenate(middles)[int(np.argmax(length))]
 
 
-def _no_common_view(cameras: Sequence[Camera], least: int) -> GeometryError:
+def _no_common_view(
+    cameras: Sequence[Camera], least: int, within_mm: FloatArray | None
+) -> GeometryError:
     names = ", ".join(camera.name for camera in cameras)
     angle = np.rad2deg(MIN_ANGLE_RAD)
+    place, remedy = "place", "turn the cameras towards each other, move them apart"
+    if within_mm is not None:
+        place, remedy = "place within the limits", "widen the limits"
     return GeometryError(
-        f"there is no place that {least} of the cameras {names} see with rays that cross at "
+        f"there is no {place} that {least} of the cameras {names} see with rays that cross at "
         f"{angle:.0f} degree or more",
-        remedy="turn the cameras towards each other, move them apart, or ask for fewer of them",
+        remedy=f"{remedy}, or ask for fewer of them" if least > 2 else remedy,
     )
 
 

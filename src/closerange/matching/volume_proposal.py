@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from closerange.errors import GeometryError
+from closerange.flags import Flag
 from closerange.geometry.arrays import FloatArray
 from closerange.matching.box_search import Slices, best_box
 from closerange.matching.segment_clipping import SecondView
@@ -35,9 +37,9 @@ _START_ANGLES_RAD = tuple(np.deg2rad([1.0, 4.0, 16.0]))
 to rays that cross at 1 degree, would have its nodes too far apart to find the best place."""
 
 _SEARCH_NODES = 25
-_ROUNDS = 5
-"""Each round looks closer at the best box of the one before; after five the sides are good to
-about 2 %, less than the rounding of the proposal."""
+_START_ROUNDS, _ROUNDS = 2, 3
+"""Each round looks closer at the best box of the one before. Two tell which start is the best;
+three more, for that one only, make its sides good to about 2 %."""
 
 _CHECK_NODES = 11
 _PUSHES = 5
@@ -45,8 +47,36 @@ _SHRINK, _SHRINKS = 0.99, 100
 """A lens may bend the walls of the region inwards: the box is then made smaller, 1 % at a time."""
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class _Sought:
+    """Cameras, what of their view counts, and where the volume may be; None for anywhere."""
+
+    cameras: tuple[Camera, ...]
+    least: int
+    margin_px: float
+    within_mm: FloatArray | None
+
+    def grid(self, box_mm: FloatArray, nodes: int) -> ViewGrid:
+        """Look at the nodes of a box."""
+        return lay_grid(
+            self.cameras, box_mm, nodes=nodes, least=self.least, margin_px=self.margin_px
+        )
+
+    def clipped(self, box_mm: FloatArray) -> FloatArray:
+        """Cut a box at the limits."""
+        return box_mm if self.within_mm is None else np.clip(box_mm, *self.within_mm)
+
+    def allows(self, box_mm: FloatArray) -> bool:
+        """Tell whether a box stays within the limits."""
+        return np.array_equal(self.clipped(box_mm), box_mm)
+
+
 def propose_volume(
-    rig: Rig | Sequence[Camera], *, least: int | None = None, margin_px: float = 0.0
+    rig: Rig | Sequence[Camera],
+    *,
+    least: int | None = None,
+    margin_px: float = 0.0,
+    within_mm: ArrayLike | None = None,
 ) -> FloatArray:
     """Propose a measuring volume: the box in which the cameras can tell most positions apart.
 
@@ -56,6 +86,8 @@ def propose_volume(
         Two or more cameras.
     least, margin_px
         As in `common_view`.
+    within_mm : array_like, shape (2, 3), optional
+        Where it may lie, such as above a table (`between_planes`); infinite on axes without limits.
 
     Returns
     -------
@@ -75,11 +107,12 @@ def propose_volume(
     would lie as far away as the cameras see, where they see least.
     """
     cameras, count = checked_cameras(rig, least, margin_px)
-    box, cell_mm = _best_start(cameras, count, margin_px)
+    limits = None if within_mm is None else checked_volume(within_mm)
+    sought = _Sought(cameras, count, margin_px, limits)
+    box, cell_mm = _best_start(sought)
     for _ in range(_SHRINKS):
-        if _fits(cameras, box, count, margin_px):
-            box = _grown(cameras, box, cell_mm, count, margin_px)
-            return _rounded_inwards(box)
+        if _fits(sought, box):
+            return _rounded_inwards(_grown(sought, box, cell_mm))
         middle = box.mean(axis=0)
         box = middle + _SHRINK * (box - middle)
     raise GeometryError(
@@ -114,7 +147,8 @@ def check_in_view(rig: Rig | Sequence[Camera], volume_mm: ArrayLike) -> None:
         lines = sight_line(camera, pixel_grid(camera), volume)
         nodes = _finite_nodes(volume)
         if (lines.flags != 0).all() and not sees_points(camera, nodes).any():
-            behind = len(nodes) and (camera.depth_mm(nodes) <= 0).all()
+            behind = (lines.flags & int(Flag.behind_camera)).any()
+            behind |= len(nodes) > 0 and (camera.depth_mm(nodes) <= 0).all()
             where = "behind it" if behind else "outside of its image"
             raise GeometryError(
                 f"camera {camera.name!r} does not see the volume, which lies {where}",
@@ -132,38 +166,42 @@ def check_in_view(rig: Rig | Sequence[Camera], volume_mm: ArrayLike) -> None:
         )
 
 
-def _best_start(
-    cameras: Sequence[Camera], least: int, margin_px: float
-) -> tuple[FloatArray, FloatArray]:
+def _best_start(sought: _Sought) -> tuple[FloatArray, FloatArray]:
     """Search from afar and from near; return the box with most positions and its grid's cell."""
-    found: list[tuple[float, FloatArray, FloatArray]] = []
+    found: list[tuple[float, ViewGrid, FloatArray]] = []
     for angle in _START_ANGLES_RAD:
         try:
             grid = field_grid(
-                cameras,
+                sought.cameras,
                 nodes=_SEARCH_NODES,
-                least=least,
-                margin_px=margin_px,
+                least=sought.least,
+                margin_px=sought.margin_px,
                 angle_rad=angle,
+                within_mm=sought.within_mm,
             )
         except GeometryError:
             if not found:
                 raise
             break  # nothing is seen so near
-        box = _box_of(grid, _most_positions(grid))
-        for _ in range(_ROUNDS - 1):
-            around = np.stack([box[0] - 2 * grid.cell_mm, box[1] + 2 * grid.cell_mm])
-            closer = lay_grid(
-                cameras, around, nodes=_SEARCH_NODES, least=least, margin_px=margin_px
-            )
-            if not closer.inside.any():
-                break
-            grid, box = closer, _box_of(closer, _most_positions(closer))
-        inner = lay_grid(cameras, box, nodes=_CHECK_NODES, least=least, margin_px=margin_px)
+        grid, box = _closer(sought, grid, _START_ROUNDS - 1)
+        inner = sought.grid(box, _CHECK_NODES)
         density = 1 / np.sqrt(np.linalg.det(inner.cov_px[inner.inside]))
-        found.append((float(density.sum() * np.prod(inner.cell_mm)), box, grid.cell_mm))
-    _, box, cell_mm = max(found, key=lambda item: item[0])
-    return box, cell_mm
+        found.append((float(density.sum() * np.prod(inner.cell_mm)), grid, box))
+    _, grid, _ = max(found, key=lambda item: item[0])
+    grid, box = _closer(sought, grid, _ROUNDS)
+    return box, grid.cell_mm
+
+
+def _closer(sought: _Sought, grid: ViewGrid, rounds: int) -> tuple[ViewGrid, FloatArray]:
+    """Lay closer grids around the best box of a grid; return the last one and its best box."""
+    box = _box_of(grid, _most_positions(grid))
+    for _ in range(rounds):
+        around = np.stack([box[0] - 2 * grid.cell_mm, box[1] + 2 * grid.cell_mm])
+        closer = sought.grid(sought.clipped(around), _SEARCH_NODES)
+        if not closer.inside.any():
+            break
+        grid, box = closer, _box_of(closer, _most_positions(closer))
+    return grid, box
 
 
 def _most_positions(grid: ViewGrid) -> Slices:
@@ -212,11 +250,12 @@ def _rounded_inwards(box_mm: FloatArray) -> FloatArray:
     return np.asarray(corners + 0.0)  # no negative zero
 
 
-def _fits(cameras: Sequence[Camera], box_mm: FloatArray, least: int, margin_px: float) -> bool:
+def _fits(sought: _Sought, box_mm: FloatArray) -> bool:
     """Test a close grid of a box, walls and corners included: in view, and evenly accurate."""
+    if not sought.allows(box_mm):
+        return False
     cell = (box_mm[1] - box_mm[0]) / (_CHECK_NODES - 1)
-    around = np.stack([box_mm[0] - cell / 2, box_mm[1] + cell / 2])
-    grid = lay_grid(cameras, around, nodes=_CHECK_NODES, least=least, margin_px=margin_px)
+    grid = sought.grid(np.stack([box_mm[0] - cell / 2, box_mm[1] + cell / 2]), _CHECK_NODES)
     if not grid.inside.all():
         return False
     variance = np.einsum("...ii->...", grid.cov_px)
@@ -224,13 +263,7 @@ def _fits(cameras: Sequence[Camera], box_mm: FloatArray, least: int, margin_px: 
     return bool(variance.max() <= (1 + 1e-6) * EVEN**2 * variance.min())
 
 
-def _grown(
-    cameras: Sequence[Camera],
-    box_mm: FloatArray,
-    cell_mm: FloatArray,
-    least: int,
-    margin_px: float,
-) -> FloatArray:
+def _grown(sought: _Sought, box_mm: FloatArray, cell_mm: FloatArray) -> FloatArray:
     """Push the walls outwards as far as they go: the best box of nodes ends at nodes."""
     box = box_mm
     for halving in range(_PUSHES):
@@ -238,7 +271,8 @@ def _grown(
             for wall, sign in ((0, -1), (1, 1)):
                 pushed = box.copy()
                 pushed[wall, axis] += sign * cell_mm[axis] / 2**halving
-                if _fits(cameras, pushed, least, margin_px):
+                pushed = sought.clipped(pushed)
+                if _fits(sought, pushed):
                     box = pushed
     return box
 

@@ -1,1 +1,1 @@
-"""The verbs: detect, calibrate, measure, verify, run, demo, report."""
+"""The verbs: detect, calibrate, volume, match, measure, verify, run, demo, report, shapes."""

@@ -6,13 +6,12 @@ import warnings
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Literal
 
 import cv2
 import numpy as np
 from numpy.typing import ArrayLike
 
-from closerange.errors import CloseRangeWarning, DetectionError, InputError
+from closerange.errors import CloseRangeWarning, DetectionError
 from closerange.features.edge_chains import chain_places
 from closerange.features.image_points import ImagePoints
 from closerange.flags import Flag
@@ -21,28 +20,26 @@ from closerange.images import Frame, check_frame
 from closerange.matching.corner_matcher import match_corners
 from closerange.matching.correspondences import Correspondences
 from closerange.matching.literal import match_literal
-from closerange.matching.literal_element import check_side
 from closerange.matching.matcher import View, match_views, views_of
 from closerange.matching.sight import inside_image
+from closerange.matching.volume_proposal import check_in_view
 from closerange.position.suspicion import DoubtWarning
 from closerange.rig.rig import Rig
 from closerange.rig.rig_file import read_rig
-from closerange.workflows.match_doubt import few_match, find_exchange
+from closerange.workflows.match_doubt import few_match, find_doubt
 from closerange.workflows.match_inputs import (
+    LITERAL_PX,
     Images,
+    Method,
+    Origin,
     Points,
+    Wanted,
     read_frames,
     read_seeds,
     volume_of,
 )
 
 Progress = Callable[[int, int], None]
-Method = Literal["default", "literal"]
-METHODS = ("default", "literal")
-
-LITERAL_PX = 15
-"""Side of the literal method's element, as in the thesis' example 1."""
-
 LITERAL_VARIANCE_PX2 = 1 / 6
 """Least variance of a literal match in x and in y: its element is cut around a whole pixel and
 placed on a whole pixel, and either rounding has the variance 1/12."""
@@ -51,7 +48,7 @@ SATURATED_REACH_PX = 2
 """Pixels around a point that may hold no saturated one: the blur of edge and operator. More than
 1 % of 25 pixels is any of them."""
 
-__all__ = ["Matched", "match", "match_images"]
+__all__ = ["Matched", "Wanted", "match", "match_images"]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -64,13 +61,19 @@ class Matched:
         Points, the reference camera first.
     doubt : str
         Why the images do not seem to be those of the cameras; empty where nothing says so.
+    remedy : str
+        What to do about it.
     volume_mm : ndarray, shape (2, 3)
         Where matches were sought; infinite where there was no limit.
+    volume_origin : {"stated", "rig", "proposed"}
+        Whether that volume was given, is the rig's, or was proposed because the rig's is flat.
     """
 
     matches: Correspondences
     doubt: str
+    remedy: str
     volume_mm: FloatArray
+    volume_origin: Origin
 
 
 def match(  # noqa: PLR0913
@@ -111,7 +114,8 @@ def match(  # noqa: PLR0913
         Least and largest Z of the points; replaces the rig's volume in Z and lifts its limits in
         X and Y.
     volume_mm : array_like, shape (2, 3), optional
-        Lower and upper corner of the volume in which the points are; the rig's by default.
+        Lower and upper corner of the volume in which the points are. By default the rig's; where
+        that is flat, what `propose_volume` proposes for the cameras.
     placement : str, optional
         Name for the rows of edges and corners; of `points`, the placement whose rows are used.
     method : {"default", "literal"}, optional
@@ -127,8 +131,8 @@ def match(  # noqa: PLR0913
     Correspondences
         One row for each point, the reference camera first, then the others as given. A match
         that may not be relied upon carries flags; one that was not found is NaN and flagged.
-        With an untrustworthy rig all matches are flagged `untrusted`; where the images seem to
-        be exchanged, `ambiguous`.
+        With an untrustworthy rig all matches are flagged `untrusted`; where the images do not
+        seem to be those of the cameras, `ambiguous`.
 
     Raises
     ------
@@ -142,109 +146,59 @@ def match(  # noqa: PLR0913
     Warns
     -----
     DoubtWarning
-        If the images seem to be exchanged.
+        If the images do not seem to be those of the cameras: exchanged, or of one view; with the
+        literal method, also if the program's matcher finds nearly nothing in them.
     CloseRangeWarning
-        If nearly nothing matches.
+        If nearly nothing matches, or the images would fit as well if they were exchanged.
     """
-    matched = match_images(
-        rig, images, points=points, edges=edges, corners=corners, z_mm=z_mm, volume_mm=volume_mm,
-        placement=placement, method=method, element_px=element_px, progress=progress,
+    wanted = Wanted(
+        points=points, edges=edges, corners=corners, z_mm=z_mm, volume_mm=volume_mm,
+        placement=placement, method=method, element_px=element_px,
     )  # fmt: skip
+    matched = match_images(rig, images, wanted, progress=progress)
     if matched.doubt:
         warnings.warn(matched.doubt, DoubtWarning, stacklevel=2)
     return matched.matches
 
 
-def match_images(  # noqa: PLR0913
-    rig: Rig | Path | str,
-    images: Images,
-    *,
-    points: Points | None = None,
-    edges: bool = False,
-    corners: bool = False,
-    z_mm: tuple[float, float] | None = None,
-    volume_mm: ArrayLike | None = None,
-    placement: str | None = None,
-    method: Method = "default",
-    element_px: int | None = None,
-    progress: Progress | None = None,
+def match_images(
+    rig: Rig | Path | str, images: Images, wanted: Wanted, *, progress: Progress | None = None
 ) -> Matched:
     """Do what `match` does; return the doubt beside the matches instead of warning of it."""
-    _check_options(points is not None, edges, corners, method, element_px)
     rig = rig if isinstance(rig, Rig) else read_rig(rig)
-    volume = volume_of(rig, z_mm, volume_mm)
     frames = read_frames(rig, images)
+    volume, origin = volume_of(rig, frames, z_mm=wanted.z_mm, volume_mm=wanted.volume_mm)
     seeds = None
-    if points is not None:
-        seeds = read_seeds(points, frames, placement)
-        frames = {seeds.camera[0]: frames[seeds.camera[0]], **frames}
-        frames = _first(frames, seeds.camera[0])
+    if wanted.points is not None:
+        seeds = read_seeds(wanted.points, frames, wanted.placement)
+        frames = {seeds.camera[0]: frames[seeds.camera[0]], **frames}  # the reference comes first
     views = views_of([rig.camera(name) for name in frames], [f.pixels for f in frames.values()])
     for view, frame in zip(views, frames.values(), strict=True):
         if not len(view.edges):
             check_frame(frame)  # not before: it takes a dense speckle for noise
-    asked = _Asked(seeds, corners, placement or "", method, element_px or LITERAL_PX)
-    found = _found(views, volume, asked, progress)
+    found = _found(views, volume, wanted, seeds, progress)
     found = _with_marks(found, frames, untrusted=not rig.trusted)
-    doubt = find_exchange(views, volume, found) if method == "default" else ""
-    if doubt:
+    doubt = find_doubt(views, rig.cameras, volume, found, literal=wanted.literal)
+    if doubt.verdict:
         found = _flag_matches(found, int(Flag.ambiguous))
-    elif (note := few_match(found)) is not None:
+    elif note := doubt.note or few_match(found):
         warnings.warn(note, CloseRangeWarning, stacklevel=3)
-    return Matched(found, doubt, volume)
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class _Asked:
-    """What is to be matched, and how."""
-
-    seeds: ImagePoints | None
-    corners: bool
-    placement: str
-    method: str
-    element_px: int
-
-
-def _check_options(
-    points: bool, edges: bool, corners: bool, method: str, element_px: int | None
-) -> None:
-    if points + edges + corners > 1:
-        given = [
-            name for name, on in (("points", points), ("edges", edges), ("corners", corners)) if on
-        ]
-        raise InputError(
-            f"{' and '.join(given)} were asked for at once", remedy="match one kind at a time"
-        )
-    if method not in METHODS:
-        raise InputError(f"method {method!r}", remedy=f"choose {' or '.join(METHODS)}")
-    if corners and method == "literal":
-        raise InputError(
-            "corners with the literal method, which matches points or edges",
-            remedy="choose the default method, or give the corners as points",
-        )
-    if element_px is not None and method != "literal":
-        raise InputError(
-            f"an element of {element_px} px with the default method, which chooses its own",
-            remedy="leave it out, or choose the literal method",
-        )
-    if element_px is not None:
-        check_side(element_px)
-
-
-def _first(frames: Mapping[str, Frame], name: str) -> dict[str, Frame]:
-    """Put one camera first; the others keep their order."""
-    return {name: frames[name], **{key: value for key, value in frames.items() if key != name}}
+    return Matched(found, doubt.verdict, doubt.remedy, volume, origin)
 
 
 def _found(
-    views: list[View], volume_mm: FloatArray, asked: _Asked, progress: Progress | None
+    views: list[View],
+    volume_mm: FloatArray,
+    wanted: Wanted,
+    seeds: ImagePoints | None,
+    progress: Progress | None,
 ) -> Correspondences:
     """Match what is asked for."""
-    if asked.seeds is not None:
-        return _of_seeds(views, volume_mm, asked, asked.seeds, progress)
-    first = views[0]
-    if asked.corners:
-        found = match_corners(views, volume_mm, placement=asked.placement, progress=progress)
+    if seeds is not None:
+        return _of_seeds(views, volume_mm, wanted, seeds, progress)
+    first, placement = views[0], wanted.placement or ""
+    if wanted.corners:
+        found = match_corners(views, volume_mm, placement=placement, progress=progress)
         if not len(found):
             raise _nothing_there(first, "corners")
         return found
@@ -254,12 +208,12 @@ def _found(
     variance = first.edges.noise_px[rows] ** 2 + first.edges.model_px[rows] ** 2
     seeds = ImagePoints.of(
         camera=first.camera.name,
-        placement=asked.placement,
+        placement=placement,
         point=edge_names(first.edges.after, rows),
         xy_px=first.edges.xy_px[rows],
         cov_px2=variance[:, None, None] * np.eye(2),
     )
-    return _of_seeds(views, volume_mm, asked, seeds, progress)
+    return _of_seeds(views, volume_mm, wanted, seeds, progress)
 
 
 def _nothing_there(view: View, what: str) -> DetectionError:
@@ -291,13 +245,14 @@ def edge_names(after: IntArray, rows: IntArray) -> list[str]:
 def _of_seeds(
     views: list[View],
     volume_mm: FloatArray,
-    asked: _Asked,
+    wanted: Wanted,
     seeds: ImagePoints,
     progress: Progress | None,
 ) -> Correspondences:
     """Match points; repeat their rows unmoved and carry their flags to the matches."""
-    if asked.method == "literal":
-        found = _literal(views, volume_mm, asked.element_px, seeds, progress)
+    if wanted.literal:
+        side_px = wanted.element_px or LITERAL_PX
+        found = _literal(views, volume_mm, side_px, seeds, progress)
     else:
         found = match_views(
             views,
@@ -335,6 +290,7 @@ def _literal(
 ) -> Correspondences:
     """Match with the thesis' method, the first view with each of the others."""
     first = views[0]
+    check_in_view([view.camera for view in views], volume_mm)
     xy, flags, mismatch = [seeds.xy_px], [seeds.flags], np.full(len(seeds), np.nan)
     for done, other in enumerate(views[1:], start=1):
         found = match_literal(

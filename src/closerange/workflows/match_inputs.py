@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import replace
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -16,11 +17,67 @@ from closerange.flags import Flag
 from closerange.geometry.arrays import FloatArray
 from closerange.images import Frame, check_duplicates, check_interlace, read_image
 from closerange.matching.correspondences import Correspondences
+from closerange.matching.literal_element import check_side
 from closerange.matching.sight import between_planes, checked_volume
+from closerange.matching.volume_proposal import propose_volume
 from closerange.rig.rig import Rig
 
 Images = Mapping[str, str | Path | Frame]
 Points = ImagePoints | Correspondences | Path | str
+Origin = Literal["stated", "rig", "proposed"]
+Method = Literal["default", "literal"]
+METHODS = ("default", "literal")
+
+LITERAL_PX = 15
+"""Side of the literal method's element, as in the thesis' example 1."""
+
+
+@dataclass(frozen=True, slots=True, eq=False, kw_only=True)
+class Wanted:
+    """What is to be matched, where and how; the options of `closerange.match`, checked.
+
+    Raises
+    ------
+    InputError
+        If options contradict each other.
+    """
+
+    points: Points | None = None
+    edges: bool = False
+    corners: bool = False
+    z_mm: tuple[float, float] | None = None
+    volume_mm: ArrayLike | None = None
+    placement: str | None = None
+    method: Method = "default"
+    element_px: int | None = None
+
+    def __post_init__(self) -> None:
+        kinds = {"points": self.points is not None, "edges": self.edges, "corners": self.corners}
+        given = [name for name, on in kinds.items() if on]
+        if len(given) > 1:
+            raise InputError(
+                f"{' and '.join(given)} were asked for at once", remedy="match one kind at a time"
+            )
+        if self.method not in METHODS:
+            raise InputError(f"method {self.method!r}", remedy=f"choose {' or '.join(METHODS)}")
+        if self.corners and self.literal:
+            raise InputError(
+                "corners with the literal method, which matches points or edges",
+                remedy="choose the default method, or give the corners as points",
+            )
+        if self.element_px is not None and not self.literal:
+            raise InputError(
+                f"an element of {self.element_px} px with the default method, which chooses its "
+                "own",
+                remedy="leave it out, or choose the literal method",
+            )
+        if self.element_px is not None:
+            check_side(self.element_px)
+
+    @property
+    def literal(self) -> bool:
+        """Whether the thesis' method is asked for."""
+        return self.method == "literal"
 
 
 def read_frames(rig: Rig, images: Images) -> dict[str, Frame]:
@@ -49,6 +106,11 @@ def read_frames(rig: Rig, images: Images) -> dict[str, Frame]:
     CloseRangeWarning
         If an image is interlaced.
     """
+    if len(rig.cameras) < 2:
+        raise InputError(
+            f"the rig has a single camera, {rig.cameras[0].name!r}; a match needs two",
+            remedy="calibrate both cameras together: closerange calibrate LEFT.csv RIGHT.csv ...",
+        )
     if len(images) < 2:
         raise InputError(
             f"{len(images)} image: a match needs two views of different cameras",
@@ -155,14 +217,21 @@ def _require_one_state(table: ImagePoints, where: str) -> None:
 
 
 def volume_of(
-    rig: Rig, z_mm: tuple[float, float] | None, volume_mm: ArrayLike | None
-) -> FloatArray:
+    rig: Rig,
+    cameras: Iterable[str],
+    *,
+    z_mm: tuple[float, float] | None = None,
+    volume_mm: ArrayLike | None = None,
+) -> tuple[FloatArray, Origin]:
     """Return where points may be: the rig's volume unless another one is given.
 
     Parameters
     ----------
     rig : Rig
-        Its measuring volume is the default.
+        Its measuring volume is the default. Where that is flat, as of control points in one
+        plane, no part could stand in it: a proposal of `propose_volume` takes its place.
+    cameras : iterable of str
+        Names of the cameras that have an image.
     z_mm : (float, float), optional
         Replaces the volume in Z and lifts its limits in X and Y.
     volume_mm : array_like, shape (2, 3), optional
@@ -170,20 +239,26 @@ def volume_of(
 
     Returns
     -------
-    ndarray, shape (2, 3)
+    volume_mm : ndarray, shape (2, 3)
         In mm, infinite where there is no limit.
+    origin : {"stated", "rig", "proposed"}
+        Whose it is.
 
     Raises
     ------
     InputError
         If both are given, or limits are not in order.
+    GeometryError
+        If a volume must be proposed, and the cameras see nothing in common.
     """
     if z_mm is not None and volume_mm is not None:
         raise InputError(
             "both --z and --volume were given", remedy="give one: --z lifts the limits in X and Y"
         )
     if z_mm is not None:
-        return between_planes(*z_mm)
-    if volume_mm is None:
-        return rig.volume_mm
-    return checked_volume(np.reshape(np.asarray(volume_mm, np.float64), (2, 3)))
+        return between_planes(*z_mm), "stated"
+    if volume_mm is not None:
+        return checked_volume(np.reshape(np.asarray(volume_mm, np.float64), (2, 3))), "stated"
+    if (rig.volume_mm[0] < rig.volume_mm[1]).all():
+        return rig.volume_mm, "rig"
+    return propose_volume([rig.camera(name) for name in cameras], least=2), "proposed"

@@ -23,8 +23,8 @@ from closerange.matching.search import plane_mapping
 from closerange.position.positions import Positions
 from closerange.rig.rig import Rig
 from closerange.settings import MatchJob, Settings, images_of, inside
-from closerange.workflows.match import LITERAL_PX, Matched, match_images
-from closerange.workflows.match_inputs import read_frames
+from closerange.workflows.match import Matched, match_images
+from closerange.workflows.match_inputs import LITERAL_PX, Wanted, read_frames
 from closerange.workflows.measure import measure
 
 
@@ -84,9 +84,7 @@ def match_scene(
     start = time.perf_counter()
     frames = read_frames(rig, _one_image_each(settings, job))
     seeds = _seeds(settings, job, frames)
-    matched = match_images(
-        rig,
-        frames,
+    wanted = Wanted(
         points=seeds,
         edges=job.match == "edges",
         corners=job.match == "corners",
@@ -94,8 +92,8 @@ def match_scene(
         volume_mm=job.volume_mm,
         method=job.method,
         element_px=job.element_px,
-        progress=progress,
     )
+    matched = match_images(rig, frames, wanted, progress=progress)
     if matched.doubt:
         text = f"job {job.name!r}: {matched.doubt}; all its matches are flagged"
         warnings.warn(text, CloseRangeWarning, stacklevel=2)

@@ -18,6 +18,7 @@ from closerange.verification.error_map import ErrorMap, judged_volume, predict_e
 from closerange.verification.result_file import SCHEMA as RESULT_SCHEMA
 from closerange.verification.result_file import read_result
 from closerange.workflows.run_tables import read_tables
+from closerange.workflows.volume import proposal_of
 
 RUN_SCHEMA = "closerange.run/1"
 
@@ -70,6 +71,7 @@ def report_of_rig(rig: Rig) -> str:
         title="Calibration",
         rig=rig,
         error_map=error_map_of(rig),
+        proposal=proposal_of(rig),
         provenance=rig.provenance,
     )
 
@@ -123,6 +125,7 @@ def report_of_run(document: Mapping[str, Any], *, folder: Path, source: str) -> 
             },
             checks=document["results"],
             error_map=error_map_of(rig),
+            proposal=proposal_of(rig),
             provenance=document["provenance"],
             notes=document["warnings"],
         )

@@ -55,21 +55,12 @@ def _root(
 @app.command(epilog=epilog("detect"))
 @verb
 def detect(
-    images: Annotated[list[str], typer.Argument(metavar="IMAGE...", help="Images or folders.")],
+    images: options.ImageFiles,
     target: Annotated[str, typer.Option(metavar="TARGET.toml", help="What to look for.")],
-    camera: Annotated[str, typer.Option(metavar="NAME", help="Camera that took the images.")],
+    camera: options.Camera,
     output: Annotated[Path, options.output("points.csv")],
-    placement: Annotated[
-        str | None, typer.Option(metavar="NAME", help="Placement; with one image only.")
-    ] = None,
-    placement_pattern: Annotated[
-        str | None,
-        typer.Option(
-            metavar="REGEX",
-            help="Searched in the file's stem: group 1 names the placement, a group named "
-            "'reading' the repeated reading.",
-        ),
-    ] = None,
+    placement: options.Placement = None,
+    placement_pattern: options.PlacementPattern = None,
     estimator: Annotated[
         str, typer.Option(help="least-squares, or border-centroid (the thesis' eq. 2.7).")
     ] = "least-squares",
@@ -118,7 +109,7 @@ def calibrate(
         typer.Option("--free-poses", help="Placements unknown; control in the target's frame."),
     ] = False,
     volume: Annotated[
-        tuple[float, float, float, float, float, float] | None,
+        options.Corners | None,
         typer.Option(metavar="X Y Z X Y Z", help="Measuring volume: lower and upper corner, mm."),
     ] = None,
     accept_untrusted: Annotated[
@@ -155,7 +146,7 @@ def calibrate(
 @app.command(epilog=epilog("measure"))
 @verb
 def measure(
-    rig: Annotated[Path, typer.Argument(metavar="RIG.json", help="Calibrated cameras.")],
+    rig: options.RigFile,
     points: Annotated[list[Path], typer.Argument(metavar="POINTS.csv...", help="Points tables.")],
     output: Annotated[Path, options.output("positions.csv")],
     times: options.Times = None,
@@ -205,6 +196,13 @@ def verify(
         tuple[float, float, float] | None,
         typer.Option(metavar="X Y Z", help="Permissible standard deviation, mm (single-point)."),
     ] = None,
+    confidence: Annotated[
+        float | None,
+        typer.Option(
+            metavar="SHARE",
+            help="How sure a decision must be, from 0.5 to below 1 (0.95); with limits.",
+        ),
+    ] = None,
     cycle_time: Annotated[
         float | None, typer.Option(metavar="SECONDS", help="Time from command to result.")
     ] = None,
@@ -223,7 +221,7 @@ def verify(
     with Progress("comparing"):
         result = work(
             kind, positions, truth=truth, rig=rig, cycle_time_s=cycle_time,
-            limits=options.limits(accuracy_limit, repeatability_limit),
+            limits=options.limits(accuracy_limit, repeatability_limit, confidence),
         )  # fmt: skip
     inputs = input_hashes([path for path in (positions, truth, rig) if path is not None])
     provenance = {**versions(), "inputs": inputs}

@@ -19,6 +19,7 @@ EXAMPLES = {
         "right=closerange-demo/inputs/blocks/right.png",
         "--edges --z -52 28 -o matches.csv --overlay match-pictures",
     ),
+    "volume": ("closerange volume closerange-demo/rig.json --z -50 30 --plot volume.svg",),
     "measure": (
         "closerange measure closerange-demo/rig.json",
         "closerange-demo/single-point-points.csv -o positions.csv",

@@ -18,12 +18,19 @@ if TYPE_CHECKING:
 
     from closerange.matching.correspondences import Correspondences
     from closerange.rig.rig import Rig
-    from closerange.workflows.match import Matched
+    from closerange.workflows.match import Matched, Wanted
+
+ORIGINS = {
+    "stated": "",
+    "rig": ", the rig's; --z or --volume replaces it",
+    "proposed": ", proposed as the rig's is flat; --z or --volume replaces it",
+}
+"""What is said of the volume in which matches were sought."""
 
 
 @verb
 def match(
-    rig: Annotated[Path, typer.Argument(metavar="RIG.json", help="Calibrated cameras.")],
+    rig: options.RigFile,
     images: Annotated[
         list[str],
         typer.Argument(
@@ -52,9 +59,11 @@ def match(
         ),
     ] = None,
     volume: Annotated[
-        tuple[float, float, float, float, float, float] | None,
+        options.Corners | None,
         typer.Option(
-            metavar="X Y Z X Y Z", help="Where the points are: lower and upper corner, mm."
+            metavar="X Y Z X Y Z",
+            help="Where the points are: lower and upper corner, mm; without it and --z the rig's "
+            "measuring volume.",
         ),
     ] = None,
     placement: Annotated[
@@ -85,33 +94,48 @@ def match(
     _json: options.Json = False,
 ) -> Outcome:
     """Find points of one image in the images of other cameras."""
-    from closerange.matching.matches_table import write_matches
     from closerange.rig.rig_file import read_rig
-    from closerange.workflows.match import match_images as work
-    from closerange.workflows.match_overlay import check_folder, write_match_pictures
-    from closerange.workflows.wire_frame import write_wire_frame
+    from closerange.workflows.match import Wanted
+    from closerange.workflows.match_overlay import check_folder
 
+    wanted = Wanted(
+        points=points, edges=edges, corners=corners, z_mm=z, volume_mm=volume,
+        placement=placement, method=method, element_px=element,  # type: ignore[arg-type]
+    )  # fmt: skip
     cameras = read_rig(rig)
     named = _images(images, cameras)
     check_outputs([output, ply], [rig, points, *named.values()])
     if overlay is not None:
         check_folder(overlay)
+    return _matched(cameras, named, wanted, output, ply=ply, overlay=overlay)
+
+
+def _matched(
+    rig: Rig,
+    images: dict[str, str],
+    wanted: Wanted,
+    output: Path,
+    *,
+    ply: Path | None,
+    overlay: Path | None,
+) -> Outcome:
+    """Match, and write what was asked for."""
+    from closerange.matching.matches_table import write_matches
+    from closerange.workflows.match import match_images
+    from closerange.workflows.match_overlay import write_match_pictures
+    from closerange.workflows.wire_frame import write_wire_frame
+
     with Progress("matching") as progress:
-        matched = work(
-            cameras, named, points=points, edges=edges, corners=corners, z_mm=z, volume_mm=volume,
-            placement=placement, method=method, element_px=element,  # type: ignore[arg-type]
-            progress=progress.step("matching"),
-        )  # fmt: skip
+        matched = match_images(rig, images, wanted, progress=progress.step("matching"))
     write_matches(matched.matches, output)
     keep(output)
-    if overlay is not None:
-        pictures = write_match_pictures(cameras, named, matched, overlay)
-    drawn = None if ply is None else write_wire_frame(cameras, matched.matches, ply)
     summary = _summary(matched, output)
-    if drawn is not None:
-        summary |= {"ply": str(ply), "vertices": drawn.vertices, "lines": drawn.lines}
     if overlay is not None:
+        pictures = write_match_pictures(rig, images, matched, overlay)
         summary |= {"overlay": [str(path) for path in pictures]}
+    if ply is not None:
+        drawn = write_wire_frame(rig, matched.matches, ply)
+        summary |= {"ply": str(ply), "vertices": drawn.vertices, "lines": drawn.lines}
     return Outcome(_text(matched, output, ply, overlay), summary, failure=_failure(matched, output))
 
 
@@ -138,7 +162,7 @@ def _images(texts: Sequence[str], rig: Rig) -> dict[str, str]:
 
 
 def _text(matched: Matched, output: Path, ply: Path | None, overlay: Path | None) -> str:
-    from closerange.apps.cli.screens import flags_text, lines
+    from closerange.apps.cli.screens import box_text, flags_text, lines
 
     matches = matched.matches
     first, *others = matches.cameras
@@ -146,6 +170,7 @@ def _text(matched: Matched, output: Path, ply: Path | None, overlay: Path | None
         ("Points", f"{int(matches.found[:, 0].sum())} of camera {first}"),
         ("Matched", f"{int(matches.clean.sum())} without a flag in {', '.join(others)}"),
         ("Flags", flags_text(matches.point_flags)),
+        ("Volume", box_text(matched.volume_mm) + ORIGINS[matched.volume_origin]),
         ("Written", output),
         ("Wire frame", ply or ""),
         ("Pictures", overlay or ""),
@@ -164,6 +189,7 @@ def _summary(matched: Matched, output: Path) -> dict[str, Any]:
         "flags": flag_counts(matches.point_flags),
         "views": {name: _view(matches, column) for column, name in enumerate(matches.cameras)},
         "volume_mm": matched.volume_mm.tolist(),
+        "volume_origin": matched.volume_origin,
         "doubt": matched.doubt,
         "output": str(output),
     }
@@ -179,16 +205,19 @@ def _view(matches: Correspondences, column: int) -> dict[str, int]:
 
 def _failure(matched: Matched, output: Path) -> CloseRangeError | None:
     """Say why the exit code is 1 although a table is written."""
+    from closerange.workflows.match_doubt import EVIDENT, OTHERWISE, evident_flag, flags_of
+
     matches = matched.matches
     if matched.doubt:
         return DataError(
             f"{matched.doubt}; all matches in {output} are flagged",
-            remedy="give each camera its own image; the table is written to be looked at",
+            remedy=f"{matched.remedy}; the table is written to be looked at",
         )
     if matches.clean.any():
         return None
+    some = ", ".join(f"{count} {flag.name}" for flag, count in flags_of(matches)[:3])
+    why = evident_flag(matches)
     return DataError(
-        f"none of the {len(matches)} points in {output} has a match without a flag",
-        remedy="the column flags says why; check the images, their order, the volume and that the "
-        "rig is the one that took them",
+        f"none of the {len(matches)} points in {output} has a match without a flag ({some})",
+        remedy=OTHERWISE if why is None else EVIDENT[why],
     )

@@ -31,6 +31,26 @@ TimeTolerance = Annotated[
         metavar="SECONDS", help="Largest time between the cameras' images of one placement."
     ),
 ]
+Placement = Annotated[
+    str | None, typer.Option("--placement", metavar="NAME", help="Placement; with one image only.")
+]
+PlacementPattern = Annotated[
+    str | None,
+    typer.Option(
+        "--placement-pattern",
+        metavar="REGEX",
+        help="Searched in the file's stem: group 1 names the placement, a group named 'reading' "
+        "the repeated reading.",
+    ),
+]
+Camera = Annotated[
+    str, typer.Option("--camera", metavar="NAME", help="Camera that took the images.")
+]
+RigFile = Annotated[Path, typer.Argument(metavar="RIG.json", help="Calibrated cameras.")]
+ImageFiles = Annotated[list[str], typer.Argument(metavar="IMAGE...", help="Images or folders.")]
+Corners = tuple[float, float, float, float, float, float]
+"""Lower and upper corner of a box: X Y Z X Y Z in mm."""
+
 Overwrite = Annotated[
     bool, typer.Option("--overwrite", help="Replace an existing folder of results.")
 ]
@@ -81,13 +101,23 @@ def image_sizes(texts: Sequence[str]) -> dict[str, tuple[int, int]]:
 def limits(
     accuracy_mm: tuple[float, float, float] | None,
     repeatability_mm: tuple[float, float, float] | None,
+    confidence: float | None,
 ) -> Limits | None:
     """Put permissible errors together; None if none is given."""
     if accuracy_mm is None and repeatability_mm is None:
+        if confidence is not None:
+            raise InputError(
+                "--confidence was given without limits to decide about",
+                remedy="give --accuracy-limit or --repeatability-limit too",
+            )
         return None
-    from closerange.verification.judgement import Limits
+    from closerange.verification.judgement import CONFIDENCE, Limits
 
-    return Limits.of(accuracy_mm=accuracy_mm, repeatability_mm=repeatability_mm)
+    return Limits.of(
+        accuracy_mm=accuracy_mm,
+        repeatability_mm=repeatability_mm,
+        confidence=CONFIDENCE if confidence is None else confidence,
+    )
 
 
 def check_times(points: Sequence[Path], times: Path | None, tolerance_s: float | None) -> None:

@@ -35,6 +35,16 @@ def lines(*pairs: tuple[str, object]) -> str:
     return "\n".join(f"{label:<13}{text}" for label, text in pairs if str(text))
 
 
+def box_text(volume_mm: FloatArray) -> str:
+    """Write the limits of a volume; axes without limits are left out."""
+    limits = [
+        f"{axis} {low:g} to {high:g}"
+        for axis, low, high in zip("XYZ", *volume_mm.tolist(), strict=True)
+        if np.isfinite([low, high]).any()
+    ]
+    return f"{', '.join(limits)} mm"
+
+
 def points_text(points: ImagePoints, output: Path) -> str:
     """Say what was detected."""
     placements = len(set(zip(points.placement, points.reading, strict=True)))

@@ -90,21 +90,12 @@ def teach(
 @app.command(epilog=epilog("shapes find"))
 @verb
 def find(
-    images: Annotated[list[str], typer.Argument(metavar="IMAGE...", help="Images or folders.")],
+    images: options.ImageFiles,
     shapes: Annotated[Path, typer.Option(metavar="SHAPES.json", help="Taught shapes.")],
-    camera: Annotated[str, typer.Option(metavar="NAME", help="Camera that took the images.")],
+    camera: options.Camera,
     output: Annotated[Path, options.output("points.csv")],
-    placement: Annotated[
-        str | None, typer.Option(metavar="NAME", help="Placement; with one image only.")
-    ] = None,
-    placement_pattern: Annotated[
-        str | None,
-        typer.Option(
-            metavar="REGEX",
-            help="Searched in the file's stem: group 1 names the "
-            "placement, a group named 'reading' the repeated reading.",
-        ),
-    ] = None,
+    placement: options.Placement = None,
+    placement_pattern: options.PlacementPattern = None,
     _json: options.Json = False,
 ) -> Outcome:
     """Find taught shapes in the images of one camera. Several images are several placements."""
