@@ -91,7 +91,10 @@ def test_the_mapping_of_a_window_is_exact_to_a_thousandth_of_a_pixel(scale):
         nodes = (ray @ normal) / ((rays.at(omega)[row] - LEFT.centre_mm) @ normal)
         slope[row] = np.linalg.lstsq(mapping.away[row], nodes - omega[row], rcond=None)[0]
         assert mapping.away[row] @ slope[row] + omega[row] == pytest.approx(nodes, rel=1e-9)
-    place, back, _ = mapping.apply(omega, slope, pace, np.tile([0.0, 1.0], (3, 1)))
+    place, back = (
+        part.transpose(0, 2, 1).astype(float)
+        for part in mapping.apply(omega, slope, pace, np.tile([0.0, 1.0], (3, 1)))[:2]
+    )
     affine_misses = 0.0
     for row, normal in enumerate(normals()):
         pixels = (mapping.corner[row] + mapping.offset) * float(scale)
@@ -102,13 +105,14 @@ def test_the_mapping_of_a_window_is_exact_to_a_thousandth_of_a_pixel(scale):
         affine_misses = max(affine_misses, np.abs(rest).max())
     assert affine_misses > 0.05  # what parabolas are for
     # a step `back` in the first view does what a shift of 1 px along the curve does
-    moved, _, _ = mapping.apply(omega + 0.01 / pace, slope, pace, np.tile([0.0, 1.0], (3, 1)))
+    moved, _, _ = mapping.apply(omega + 0.1 / pace, slope, pace, np.tile([0.0, 1.0], (3, 1)))
+    moved = moved.transpose(0, 2, 1)
     side = 41
     for row in range(3):
         by_x = np.gradient(place[row].reshape(side, side, 2), axis=1).reshape(-1, 2)
         by_y = np.gradient(place[row].reshape(side, side, 2), axis=0).reshape(-1, 2)
         made = by_x * back[row][:, :1] + by_y * back[row][:, 1:]
-        assert (moved[row] - place[row]) / 0.01 == pytest.approx(made, abs=2e-2)
+        assert (moved[row] - place[row]) / 0.1 == pytest.approx(made, abs=2e-2)
 
 
 def test_tilts_are_tried_only_where_they_matter():

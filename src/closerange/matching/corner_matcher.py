@@ -139,7 +139,7 @@ def _heights(pencil: Pencil, corners: Corners, matches: EdgeMatches, axis: int) 
         value, variance = np.array(fits).T
         height[number] = np.average(value, weights=1 / variance)
         std[number] = np.sqrt(1 / np.sum(1 / variance))
-        mismatch[number] = np.mean(matches.cost[point][matches.flags[point] == 0])
+        mismatch[number] = max(0.0, np.mean(matches.cost[point][matches.flags[point] == 0]))
         if (np.abs(value - height[number]) > AGREE * np.sqrt(variance)).any():
             flags[number] = int(Flag.ambiguous)
     return _Heights(height, std, mismatch, flags)

@@ -23,6 +23,13 @@ from closerange.matching.correspondences import Correspondences
 from closerange.matching.edge_matcher import EdgeMatches, match_edges, on_rays
 from closerange.matching.pencil import Pencil
 from closerange.matching.sight import checked_volume, inside_image
+from closerange.matching.texture import (
+    FEW,
+    believes_window,
+    mostly_texture,
+    texture_lines,
+    wants_window,
+)
 from closerange.matching.volume_proposal import check_in_view
 from closerange.matching.window_matcher import WindowMatches, match_windows
 from closerange.rig.camera import Camera
@@ -32,21 +39,6 @@ ON_EDGE_PX = 1.0
 
 ACROSS_PX = 0.02
 """Least standard deviation across the epipolar curve: a match lies on the curve by construction."""
-
-TEXTURE_WINDOW_PX = 31
-"""Side of the square in which edge points are counted."""
-
-TEXTURE_LINES = 5.0
-"""So many straight edges through that square are texture, if they go several ways: a corner of a
-part has three."""
-
-MOSTLY_TEXTURE = 0.3
-"""Share of an image's edge points on texture above which the scene is taken for a textured one.
-Plain parts have less than a tenth there, a speckled plate or a plant two thirds and more."""
-
-TEXTURE_ONE_WAY = 0.6
-"""Length of the mean of the doubled directions, from 0 (all ways) to 1 (parallel), above which
-edges are taken for parallel."""
 
 OWN_SHARE = 0.3
 """Least share of a match's uncertainty that stays with it when the seed's own is taken out."""
@@ -202,21 +194,40 @@ def _pair(
     seeds: FloatArray,
     seed_cov: FloatArray,
 ) -> Found:
-    """Match by edges what lies on an edge of a plain part, by windows all else."""
+    """Match by edges what lies on an edge, by windows what lies on texture or on neither."""
     pencil = Pencil.of(first.camera, second.camera)
     greys = (first.pixels.astype(np.float32), second.pixels.astype(np.float32))
-    edges = (plain_edges(first.edges), plain_edges(second.edges))
-    near, edge = _nearest(edges[0], seeds)
+    edges = (first.edges, second.edges)
+    near, edge = _nearest(first.edges, seeds)
+    lines = texture_lines(first.edges)
+    textured = mostly_texture(lines)
     found = _nothing(len(seeds))
-    if near.any():
-        others = [(view.camera, plain_edges(view.edges)) for view in rest]
+    if near.any() and not (textured and near.sum() < FEW * len(first.edges)):
+        others = [(view.camera, view.edges) for view in rest]
         matches = match_edges(pencil, edges, greys, volume_mm, others)
         rows = np.flatnonzero(near)
         _put(found, rows, _by_edges(pencil, matches, edge[rows], seeds[rows], seed_cov[rows]))
-    rows = np.flatnonzero(~near & all_finite(seeds, 1) & inside_image(first.camera, seeds))
-    if rows.size:
-        windows = match_windows(pencil, greys, edges, seeds[rows], volume_mm)
-        _put(found, rows, _by_windows(windows))
+    further = [(view.camera, view.pixels) for view in rest]
+    on_texture = np.flatnonzero(near)
+    wanted = wants_window(lines[edge[near]], found.flags[near], textured=textured)
+    on_texture = on_texture[wanted]
+    beside = np.flatnonzero(~near & all_finite(seeds, 1) & inside_image(first.camera, seeds))
+    none = np.zeros(0, dtype=np.int64)
+    if textured:
+        edges = (first.edges.select(none), second.edges.select(none))
+    if beside.size:
+        windows = match_windows(pencil, greys, edges, seeds[beside], volume_mm, others=further)
+        _put(found, beside, _by_windows(windows))
+    if on_texture.size:
+        edges = (first.edges.select(none), second.edges.select(none))
+        windows = match_windows(pencil, greys, edges, seeds[on_texture], volume_mm, others=further)
+        part = _by_windows(windows)
+        better = believes_window(
+            lines[edge[on_texture]],
+            (found.flags[on_texture], found.xy_px[on_texture]),
+            (part.flags, part.xy_px),
+        )
+        _put(found, on_texture[better], _rows(part, better))
     outside = all_finite(found.xy_px, 1) & ~inside_image(second.camera, found.xy_px)
     found.flags[outside] |= int(Flag.outside_image)
     return found
@@ -225,6 +236,10 @@ def _pair(
 def _put(found: Found, rows: IntArray, part: Found) -> None:
     for name in ("xy_px", "cov_px2", "mismatch", "flags"):
         getattr(found, name)[rows] = getattr(part, name)
+
+
+def _rows(part: Found, rows: BoolArray) -> Found:
+    return Found(part.xy_px[rows], part.cov_px2[rows], part.mismatch[rows], part.flags[rows])
 
 
 def _by_edges(
@@ -242,7 +257,8 @@ def _by_edges(
     flags[lost & (flags == 0)] |= int(Flag.occluded)
     cov = _match_cov(matches, edge, seed_cov)
     cov[lost] = np.nan
-    return Found(xy_px, cov, matches.cost[edge], flags)
+    # a third view that agrees lowers the cost, even below nothing: a misfit is none then
+    return Found(xy_px, cov, np.maximum(matches.cost[edge], 0.0), flags)
 
 
 def _by_windows(matches: WindowMatches) -> Found:
@@ -253,57 +269,6 @@ def _by_windows(matches: WindowMatches) -> Found:
     cov = along_and_across(matches.epipolar, matches.std_px**2, across)
     cov[lost] = np.nan
     return Found(np.array(matches.xy_px), cov, np.array(matches.cost), flags)
-
-
-def plain_edges(edges: EdgePoints) -> EdgePoints:
-    """Return the edges of an image of plain parts, and none of a textured scene.
-
-    Where edges of all directions lie close together every candidate finds some edge near it, while
-    a window of grey values is unlike any other: such a scene is better matched by windows.
-
-    Parameters
-    ----------
-    edges : EdgePoints
-        N points.
-
-    Returns
-    -------
-    EdgePoints
-        All of them, or none if `MOSTLY_TEXTURE` of them lie on texture.
-    """
-    textured = texture_lines(edges) > TEXTURE_LINES
-    mostly = textured.any() and textured.mean() > MOSTLY_TEXTURE
-    return edges.select(np.zeros(len(edges), dtype=bool)) if mostly else edges
-
-
-def texture_lines(edges: EdgePoints) -> FloatArray:
-    """Return how many straight edges would make as much texture as there is around each point.
-
-    Texture is where many edges of many directions lie close together. Coils, teeth and other
-    parallel edges have one direction and count as none.
-
-    Parameters
-    ----------
-    edges : EdgePoints
-        N points.
-
-    Returns
-    -------
-    ndarray, shape (N,)
-        Edge points in a square of `TEXTURE_WINDOW_PX` per side of it; 0 where they are parallel.
-    """
-    width, height = edges.size_px
-    column, row = np.rint(edges.xy_px).astype(np.int64).T
-    twice = 2 * np.arctan2(edges.normal[:, 1], edges.normal[:, 0])
-    sums = []
-    for value in (np.ones(len(edges)), np.cos(twice), np.sin(twice)):
-        image = np.zeros((height, width), dtype=np.float32)
-        np.add.at(image, (row, column), value.astype(np.float32))
-        window = (TEXTURE_WINDOW_PX, TEXTURE_WINDOW_PX)
-        summed = cv2.boxFilter(image, -1, window, normalize=False, borderType=cv2.BORDER_CONSTANT)
-        sums.append(summed[row, column])
-    one_way = np.hypot(sums[1], sums[2]) > TEXTURE_ONE_WAY * sums[0]
-    return np.where(one_way, 0.0, sums[0] / TEXTURE_WINDOW_PX)
 
 
 def _nothing(count: int) -> Found:

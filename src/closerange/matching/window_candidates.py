@@ -2,14 +2,22 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields
+from collections.abc import Sequence
+from dataclasses import dataclass, fields, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from closerange.geometry.arrays import FloatArray, IntArray
 from closerange.matching.window_planes import SeedRays
-from closerange.matching.window_scores import scores
+from closerange.matching.window_scores import SHAPES, scores
+from closerange.rig.camera import Camera
+
+Pyramid = list[NDArray[np.float32]]
+
+OTHER_LEVEL = 1
+"""Level on which further views are looked at: a place good to a pixel in the second view may be two
+or three off in one that stands further away."""
 
 KEPT = 8
 """Places that are looked at more finely: the best of each shape, and the best others."""
@@ -100,8 +108,9 @@ def start_level(samples: int, hypotheses: int, size_px: tuple[int, int]) -> int:
 def find_places(
     rays: SeedRays,
     omega: FloatArray,
-    images: tuple[list[NDArray[np.float32]], list[NDArray[np.float32]]],
+    images: tuple[Pyramid, Pyramid],
     tilts: FloatArray,
+    others: Sequence[tuple[Camera, Pyramid]] = (),
 ) -> Places:
     """Find the best and the second-best place of each window on its epipolar segment.
 
@@ -120,6 +129,8 @@ def find_places(
         Pyramids of both views, with as many levels as are to be swept.
     tilts : ndarray, shape (H, 2)
         Hypotheses of the surface's tilt.
+    others : sequence of (Camera, pyramid), optional
+        Further views: what a place explains there too speaks for it.
 
     Returns
     -------
@@ -137,9 +148,77 @@ def find_places(
     for level in range(top - 1, -1, -1):
         place = _hopeful(place, levels)
         pair = (images[0][level], images[1][level])
-        place, hypothesis, value = _refined(rays, place, pair, 1 << level, tilts)
+        place, hypothesis, value = _refined(rays, place, pair, 1 << level, tilts, hypothesis)
         levels.append(value)
-    return _decided(rays, place, tilts[hypothesis], levels[::-1][:TOGETHER])
+    told = _elsewhere(rays, place, images[0], tilts, others)
+    prior = np.zeros(told.shape)
+    return _decided(rays, place, tilts[hypothesis], levels[::-1][:TOGETHER], (prior, told))
+
+
+def choose_places(
+    rays: SeedRays,
+    place: FloatArray,
+    prior: FloatArray,
+    images: tuple[Pyramid, Pyramid],
+    tilts: FloatArray,
+    others: Sequence[tuple[Camera, Pyramid]] = (),
+) -> Places:
+    """Choose the best and the second-best of places that are known beforehand.
+
+    Parameters
+    ----------
+    rays : SeedRays
+        N seeds.
+    place : ndarray, shape (N, C)
+        Inverse depths, good to a sample of the uppermost level; NaN fills up at the end.
+    prior : ndarray, shape (N, C)
+        Logarithms of the likelihood that they have by other evidence.
+    images : tuple of two lists of ndarrays
+        Pyramids of both views.
+    tilts : ndarray, shape (H, 2)
+        Hypotheses of the surface's tilt.
+    others : sequence of (Camera, pyramid), optional
+        Further views.
+
+    Returns
+    -------
+    Places
+        One row for each seed.
+    """
+    top = len(images[0]) - 1
+    pairs = list(zip(*images, strict=True))
+    # tilts show best on the uppermost level
+    place, hypothesis, value = _refined(rays, place, pairs[top], 1 << top, tilts, reach=0)
+    for level in range(top - 1, -1, -1):
+        place, hypothesis, value = _refined(
+            rays, place, pairs[level], 1 << level, tilts, hypothesis
+        )
+    levels = [value]
+    # places half a plane off must not count less than those that happen to lie on one
+    for level in range(1, min(top + 1, TOGETHER)):
+        _, _, value = _refined(rays, place, pairs[level], 1 << level, tilts, hypothesis, reach=0)
+        levels.append(value)
+    told = _elsewhere(rays, place, images[0], tilts, others)
+    prior = prior[:, : place.shape[1]]
+    return _decided(rays, place, tilts[hypothesis], levels, (prior, told))
+
+
+def _elsewhere(
+    rays: SeedRays,
+    place: FloatArray,
+    first: Pyramid,
+    tilts: FloatArray,
+    others: Sequence[tuple[Camera, Pyramid]],
+) -> FloatArray:
+    """Return what further views say for places: a reward, as they may be hidden there."""
+    told = np.zeros(place.shape)
+    for camera, pyramid in others:
+        level = min(OTHER_LEVEL, len(pyramid) - 1, len(first) - 1)
+        pair = (first[level], pyramid[level])
+        towards = replace(rays, second=camera)
+        _, _, value = _refined(towards, place, pair, 1 << level, tilts, reach=1)
+        told[:, : value.shape[1]] += np.maximum(value.mean(axis=2), 0.0)
+    return told
 
 
 def _hopeful(place: FloatArray, levels: list[FloatArray]) -> FloatArray:
@@ -174,8 +253,15 @@ def _refined(
     images: tuple[NDArray[np.float32], NDArray[np.float32]],
     scale: int,
     tilts: FloatArray,
+    hypothesis: IntArray | None = None,
+    *,
+    reach: int = NEAR,
 ) -> tuple[FloatArray, IntArray, FloatArray]:
-    """Look around places on a finer level; return places, tilts and the likelihood of shapes."""
+    """Look around places on a finer level; return places, tilts and the likelihood of shapes.
+
+    Of the tilts only that of the coarser level is tried again, and none: a window that straddled
+    two surfaces lies on one of them when it is half as wide.
+    """
     known = np.isfinite(place)
     used = int(np.flatnonzero(known.any(axis=0)).max(initial=0)) + 1
     place, known = place[:, :used], known[:, :used]
@@ -183,27 +269,58 @@ def _refined(
     step = np.full(place.shape, np.nan)
     pace = rays.select(point).pace(place[known])
     step[known] = scale / np.linalg.norm(pace, axis=1)
-    near = place[:, :, None] + step[:, :, None] * np.arange(-NEAR, NEAR + 1)
-    near = np.where(near > 0, near, place[:, :, None])
+    near = place[:, :, None] + step[:, :, None] * np.arange(-reach, reach + 1)
+    near = np.where(near > 0, near, place[:, :, None])[point, column]
     single = rays.select(point)
-    value, tilt = scores(single, near[point, column], images, scale, tilts)
+    if hypothesis is None:
+        value, tilt = scores(single, near, images, scale, tilts)
+    else:
+        given = hypothesis[:, :used][known]
+        value, tilt = _scores_of(single, near, images, scale, tilts, given)
     mean = value.mean(axis=2)
     best = mean.argmax(axis=1)
     pick = np.arange(len(point))
     # where a level shows nothing, chance must not move what a coarser one has found
-    best = np.where(mean[pick, best] > mean[:, NEAR] + TELLING, best, NEAR)
-    place, hypothesis = place.copy(), np.zeros(place.shape, dtype=np.int64)
-    place[known] = near[point, column][pick, best]
-    hypothesis[known] = tilt[pick, best]
+    best = np.where(mean[pick, best] > mean[:, reach] + TELLING, best, reach)
+    place, found = place.copy(), np.zeros(place.shape, dtype=np.int64)
+    place[known] = near[pick, best]
+    found[known] = tilt[pick, best]
     likely = np.full((*place.shape, value.shape[2]), -np.inf)
     likely[known] = value.max(axis=1)
-    return place, hypothesis, likely
+    return place, found, likely
+
+
+def _scores_of(
+    rays: SeedRays,
+    omega: FloatArray,
+    images: tuple[NDArray[np.float32], NDArray[np.float32]],
+    scale: int,
+    tilts: FloatArray,
+    hypothesis: IntArray,
+) -> tuple[FloatArray, IntArray]:
+    """Compare windows under no tilt and under one that is given for each."""
+    value = np.full((*omega.shape, SHAPES), -np.inf)
+    tilt = np.zeros(omega.shape, dtype=np.int64)
+    for number in np.unique(hypothesis):
+        rows = np.flatnonzero(hypothesis == number)
+        tried = np.unique([0, number])
+        value[rows], best = scores(rays.select(rows), omega[rows], images, scale, tilts[tried])
+        tilt[rows] = tried[best]
+    return value, tilt
 
 
 def _decided(
-    rays: SeedRays, place: FloatArray, tilt: FloatArray, levels: list[FloatArray]
+    rays: SeedRays,
+    place: FloatArray,
+    tilt: FloatArray,
+    levels: list[FloatArray],
+    more: tuple[FloatArray, FloatArray],
 ) -> Places:
-    """Choose size and shape by the evidence, and with them the best two places."""
+    """Choose size and shape by the evidence, and with them the best two places.
+
+    What neighbours say beforehand (`more`, first) has a say in the choice, but is no evidence: on a
+    pattern that repeats they all repeat the same guess. What further views show (second) is both.
+    """
     used = place.shape[1]
     known = np.isfinite(place)
     point, _ = np.nonzero(known)
@@ -211,7 +328,8 @@ def _decided(
     seen[known] = rays.second.project(rays.select(point).at(place[known]))
     sums = np.cumsum([level[:, :used] for level in levels], axis=0)
     sums = np.concatenate(list(sums), axis=2)  # (N, C, sizes x shapes)
-    best = sums.argmax(axis=1)
+    sums += more[1][:, :used, None]
+    best = (sums + more[0][:, :used, None]).argmax(axis=1)
     rows = np.arange(len(place))[:, None]
     away = np.linalg.norm(seen[:, :, None, :] - seen[rows, best][:, None, :, :], axis=3) > APART_PX
     others = np.where(away, sums, -np.inf)

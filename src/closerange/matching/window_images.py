@@ -90,13 +90,18 @@ class ImagePair:
         if scale not in self._levels:
             number = scale.bit_length() - 1
             first, second = (part[number] for part in self.pyramids(number))
-            # a halving averages over four pixels and more
-            noise = [
-                cv2.resize(part, image.shape[::-1], interpolation=cv2.INTER_NEAREST) / scale
-                for part, image in zip(self._noise, (first, second), strict=True)
-            ]
-            self._levels[scale] = Level.of((first, second), (noise[0], noise[1]))
+            self._levels[scale] = Level.of((first, second), self.noises(number))
         return self._levels[scale]
+
+    def noises(self, number: int) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+        """Return the standard deviation of the noise of both images on a level of the pyramid."""
+        pair = (part[number] for part in self.pyramids(number))
+        # a halving averages over four pixels and more
+        first, second = (
+            cv2.resize(part, image.shape[::-1], interpolation=cv2.INTER_NEAREST) / (1 << number)
+            for part, image in zip(self._noise, pair, strict=True)
+        )
+        return first, second
 
 
 def pyramid(images: list[NDArray[np.float32]], levels: int) -> list[NDArray[np.float32]]:

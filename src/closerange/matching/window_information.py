@@ -17,6 +17,10 @@ HALF_WIDTHS = (5, 7, 10, 14, 20, 28, 40)
 """Half-widths, px, from which one is chosen for each point: the area doubles from one to the next.
 Fewer than 11 x 11 px leave nothing to judge the fit of five parameters by."""
 
+WIDEST_SHARE = 1 / 16
+"""Half-width of the largest window per image width, where that is more than 40 px: a camera of
+twice the resolution shows a part twice as large, and its windows may be so too."""
+
 SIGMA_SHARE = 0.5
 """Standard deviation of the Gaussian weights per half-width: at the rim a seventh is left."""
 
@@ -89,6 +93,14 @@ class Information:
         x, y = direction.T
         xx, xy, yy = np.moveaxis(self.tensor, 2, 0)
         return np.asarray(np.maximum(x * x * xx + 2 * x * y * xy + y * y * yy, 0.0))
+
+
+def half_widths(width_px: int) -> tuple[int, ...]:
+    """Return the half-widths from which one is chosen in images so wide, px."""
+    widths = list(HALF_WIDTHS)
+    while widths[-2] * 2 <= WIDEST_SHARE * width_px:
+        widths.append(widths[-2] * 2)
+    return tuple(widths)
 
 
 def noise_map(grey: NDArray[np.float32]) -> NDArray[np.float32]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from typing import Any
@@ -15,27 +16,21 @@ from closerange.flags import Flag
 from closerange.geometry.arrays import FloatArray, IntArray, all_finite
 from closerange.matching.pencil import Pencil
 from closerange.matching.search import checked_volume, inside_image
-from closerange.matching.window_images import ImagePair
+from closerange.matching.window_candidates import OTHER_LEVEL
+from closerange.matching.window_images import ImagePair, pyramid
 from closerange.matching.window_information import (
-    HALF_WIDTHS,
     Information,
     chosen_sizes,
+    half_widths,
 )
 from closerange.matching.window_plain import match_plain
 from closerange.matching.window_planes import SeedRays
-from closerange.matching.window_texture import (
-    UNSURE_PX,
-    Found,
-    match_textured,
-    refining_scale,
-    segment_omegas,
-)
+from closerange.matching.window_search import PIECE, Search, Spans
+from closerange.matching.window_texture import UNSURE_PX, Found, match_textured, refining_scale
+from closerange.rig.camera import Camera
 
 EPIPOLAR_PX = 0.1
 """Standard deviation of epipolar curves: what a good calibration leaves."""
-
-PIECE = 1000
-"""Points that are worked on at once."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -57,6 +52,9 @@ class WindowMatches:
         Misfit of the window or of the edges around the point, px along the curve.
     half_width_px : ndarray, shape (N,)
         Of the structuring element that was chosen.
+    half_width_mm : ndarray, shape (N,)
+        The same at the depth of the match. What is asked of a window, and the largest that is
+        tried, follow the resolution: twice as many px per mm make it at most a step smaller.
     flags : ndarray of int, shape (N,)
         `Flag` bits; 0 for what may be relied upon.
     """
@@ -67,6 +65,7 @@ class WindowMatches:
     epipolar: FloatArray
     cost: FloatArray
     half_width_px: FloatArray
+    half_width_mm: FloatArray
     flags: IntArray
 
 
@@ -79,6 +78,7 @@ def match_windows(
     *,
     half_width_px: int | None = None,
     epipolar_px: float = EPIPOLAR_PX,
+    others: Sequence[tuple[Camera, NDArray[Any]]] = (),
 ) -> WindowMatches:
     """Match points of the first view by what surrounds them.
 
@@ -102,6 +102,8 @@ def match_windows(
         One half-width for the refinement of all points instead of a choice for each.
     epipolar_px : float, optional
         Standard deviation of the epipolar curves that the calibration leaves.
+    others : sequence of (Camera, ndarray), optional
+        Further views and their grey values: what a place explains there too speaks for it.
 
     Returns
     -------
@@ -122,26 +124,30 @@ def match_windows(
     if not len(points):
         return _matches(rays, found, volume)
     pair = ImagePair(greys)
-    widths = HALF_WIDTHS if half_width_px is None else (half_width_px,)
+    widths = half_widths(pencil.first.size_px[0]) if half_width_px is None else (half_width_px,)
     pair.prepare({refining_scale(width) for width in widths})
     information = Information.of(pair.greys[0], np.nan_to_num(points), widths)
 
-    def piece(rows: slice) -> Found:
-        some = rays.select(rows)
-        omega, flags = _segments(pencil, some, volume)
-        size = _sizes(some, omega, information.select(rows), widths, half_width_px is not None)
-        part = _open(omega, flags)
-        textured = np.flatnonzero((part.flags == int(Flag.no_edge)) & (size > 0))
-        if textured.size:
-            chosen = some.select(textured), omega[textured], size[textured]
-            part.put(textured, match_textured(pencil, pair, *chosen, volume, epipolar_px))
-        return part
+    spans = Spans.of(pencil, rays, volume)
+    size = _sizes(rays, spans.middle, information, widths, half_width_px is not None)
+    found = _open(rays, spans)
+    textured = np.flatnonzero((found.flags == int(Flag.no_edge)) & (size > 0))
+    further = tuple(
+        (camera, pyramid([np.asarray(grey, np.float32)], OTHER_LEVEL)) for camera, grey in others
+    )
+    search = Search(pencil, pair, volume, epipolar_px, further)
+    search = search.swept(rays.select(textured), spans.select(textured))
 
-    pieces = [slice(start, start + PIECE) for start in range(0, len(points), PIECE)]
+    def piece(part: slice) -> Found:
+        rows = textured[part]
+        number = np.arange(len(textured))[part]
+        return match_textured(search, rays.select(rows), size[rows], number)
+
+    pieces = [slice(start, start + PIECE) for start in range(0, len(textured), PIECE)]
     # two at a time: OpenCV, BLAS and SciPy release the interpreter for most of the work
     with ThreadPoolExecutor(2) as pool:
-        for rows, part in zip(pieces, pool.map(piece, pieces), strict=True):
-            found.put(rows, part)
+        for part, matched in zip(pieces, pool.map(piece, pieces), strict=True):
+            found.put(textured[part], matched)
     plain = np.flatnonzero(np.isfinite(found.omega) & (found.flags == int(Flag.no_edge)))
     if plain.size:
         middle = found.omega[plain]
@@ -149,38 +155,30 @@ def match_windows(
     return _matches(rays, found, volume)
 
 
-def _segments(pencil: Pencil, rays: SeedRays, volume_mm: FloatArray) -> tuple[FloatArray, IntArray]:
-    """Return inverse depths along the segments, and flags where there is nothing to search."""
-    omega, flags = segment_omegas(pencil, rays, volume_mm)
-    inside = inside_image(rays.first, rays.xy_px)
-    flags = np.where(inside | (flags != 0), flags, int(Flag.outside_image))
-    empty = (flags == 0) & ~np.isfinite(omega).any(axis=1)
-    return omega, np.where(empty, int(Flag.outside_image), flags)
-
-
-def _open(omega: FloatArray, flags: IntArray) -> Found:
+def _open(rays: SeedRays, spans: Spans) -> Found:
     """Mark the points to be matched as `no_edge`, in the middle of their segments."""
-    found = Found.empty(len(flags))
-    found.flags[:] = flags
-    rows = np.flatnonzero(flags == 0)
-    found.omega[rows] = np.nanmedian(omega[rows], axis=1)
+    found = Found.empty(len(rays))
+    inside = inside_image(rays.first, rays.xy_px)
+    found.flags[:] = np.where(inside | (spans.flags != 0), spans.flags, int(Flag.outside_image))
+    rows = np.flatnonzero(found.flags == 0)
+    found.omega[rows] = spans.middle[rows]
     found.flags[rows] = int(Flag.no_edge)
     return found
 
 
 def _sizes(
     rays: SeedRays,
-    omega: FloatArray,
+    middle: FloatArray,
     information: Information,
     widths: tuple[int, ...],
     fixed: bool,
 ) -> IntArray:
     """Return the half-width of each window, px; 0 where there is no texture."""
     sizes = np.zeros(len(rays), dtype=np.int64)
-    known = np.asarray(np.isfinite(omega).any(axis=1))
+    known = np.isfinite(middle)
     if not known.any():
         return sizes
-    back = rays.select(known).back(np.nanmedian(omega[known], axis=1))
+    back = rays.select(known).back(middle[known])
     # the second image is as noisy as the first
     told = information.select(known).along(np.nan_to_num(back)) / 2
     chosen = chosen_sizes(told, widths, UNSURE_PX if fixed else None)
@@ -202,6 +200,7 @@ def _matches(rays: SeedRays, found: Found, volume_mm: FloatArray) -> WindowMatch
         outside = known & ~((xyz >= volume_mm[0]) & (xyz <= volume_mm[1])).all(axis=1)
     flags[outside] |= int(Flag.outside_volume)
     flags[~known & (flags == 0)] |= int(Flag.not_found)
+    focal = np.sqrt(rays.first.matrix_px[0, 0] * rays.first.matrix_px[1, 1])
     return WindowMatches(
         xyz,
         rays.second.project(xyz) + found.across_px[:, None] * beside,
@@ -209,6 +208,7 @@ def _matches(rays: SeedRays, found: Found, volume_mm: FloatArray) -> WindowMatch
         epipolar,
         found.cost,
         found.half_width_px,
+        found.half_width_px / (focal * found.omega),
         flags,
     )
 

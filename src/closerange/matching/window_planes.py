@@ -133,6 +133,22 @@ class SeedRays:
             change = np.einsum("ni,nij->nj", normal, self.by_px) / facing[:, None]
         return np.asarray(omega[:, None] * change)
 
+    def along_plane(self, tilt: FloatArray) -> FloatArray:
+        """Return inverse depths of all rays on one plane, those of the middle one being 1.
+
+        Parameters
+        ----------
+        tilt : ndarray, shape (2,)
+            Tangents of the plane's tilt.
+
+        Returns
+        -------
+        ndarray, shape (N,)
+            Planes that are parallel have the same ones, times the inverse depth of the middle.
+        """
+        facing = self.ray @ self._normals(tilt[None])[0]
+        return np.asarray(facing / facing[len(facing) // 2])
+
     def _normals(self, tilts: FloatArray) -> FloatArray:
         across = np.eye(3)[self.axis]
         along = self.second.centre_mm - self.first.centre_mm

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.ndimage import map_coordinates
 
 from closerange.geometry.arrays import BoolArray, FloatArray, IntArray
@@ -20,8 +21,10 @@ from closerange.matching.window_system import (
     gain_and_offset,
     inverse_covariance,
     noise_part,
+    right_side,
     shift_std,
     spread,
+    squares,
 )
 
 GROSS = 2.5
@@ -42,6 +45,9 @@ edge differs by as much from view to view."""
 
 STILL_PX = 0.01
 """A step below it ends the iteration; the next one is shorter by far."""
+
+STILL_SHARE = 0.1
+"""So does a step of this share of the standard deviation, where the texture is weak."""
 
 DONE_PX = 0.05
 """A last step longer than that is no end."""
@@ -123,6 +129,7 @@ class _State:
     offset: FloatArray
     across: FloatArray
     last: FloatArray
+    still: FloatArray
 
 
 def refine_windows(
@@ -188,8 +195,9 @@ class _Fit:
     ) -> None:
         omega, tilt = start
         self.beside_precision = epipolar_px**-2
-        self.offset = mapping.offset * float(mapping.scale)
-        self.mapping, self.level, self.weight = mapping, level, weight
+        x, y = (mapping.offset * float(mapping.scale)).T
+        self.place = np.stack([np.ones_like(x), x, y, x * x, x * y, y * y], 1).astype(np.float32)
+        self.mapping, self.level, self.weight = mapping, level, weight.astype(np.float32)
         rays = mapping.rays
         pace = rays.pace(omega)
         self.pace = np.linalg.norm(pace, axis=1)
@@ -203,8 +211,11 @@ class _Fit:
         pixel = mapping.corner[:, None, :] + mapping.offset
         self.inside = np.asarray(((pixel >= 0) & (pixel < [width, height])).all(axis=2))
         x, y = np.clip(pixel, 0, [width - 1, height - 1]).transpose(2, 0, 1)
-        self.grey = level.grey[y, x].astype(np.float64)
+        grey = level.grey[y, x]
+        # in the middle of its window, so that float32 is fine enough for 16 bits
+        self.grey = grey - grey.mean(axis=1, keepdims=True)
         self.slopes = level.slope_x[y, x], level.slope_y[y, x]
+        self.steepness = np.hypot(*self.slopes)
         count = len(omega)
         self.state = _State(
             omega=omega.copy(),
@@ -214,6 +225,7 @@ class _Fit:
             offset=np.zeros(count),
             across=np.zeros(count),
             last=np.full(count, np.inf),
+            still=np.zeros(count),
         )
 
     def run(self) -> Refined:
@@ -222,7 +234,8 @@ class _Fit:
         active = np.arange(len(state.omega))
         for turn in range(ROUNDS):
             self._step(active, with_gain=turn == 0)
-            active = active[state.last[active] > STILL_PX * self.mapping.scale]
+            still = np.maximum(STILL_PX * self.mapping.scale, state.still[active])
+            active = active[state.last[active] > still]
             if not active.size:
                 break
         return self._judged()
@@ -234,29 +247,24 @@ class _Fit:
         place, back, side = mapping.apply(
             state.omega[rows], state.slope[rows], self.pace[rows], beside
         )
-        place = place + (state.across[rows, None] * beside / mapping.scale)[:, None, :]
+        moved = state.across[rows, None] * beside / mapping.scale
+        x, y = (place[:, k] + moved[:, k, None].astype(np.float32) for k in (0, 1))
         height, width = self.level.spline.shape
-        there = ((place >= 1) & (place <= [width - 2, height - 2])).all(axis=2)
-        place = np.nan_to_num(place, nan=0.0)
+        good = (x >= 1) & (x <= width - 2) & (y >= 1) & (y <= height - 2) & self.inside[rows]
+        good &= np.isfinite(back[:, 0])
+        x, y = np.where(good, x, np.float32(0.0)), np.where(good, y, np.float32(0.0))
         values = map_coordinates(
-            self.level.spline,
-            place.reshape(-1, 2).T[::-1],
-            order=3,
-            mode="mirror",
-            prefilter=False,
-            output=np.float64,
-        ).reshape(place.shape[:2])
-        changes = [
-            self.slopes[0][rows] * step[..., 0] + self.slopes[1][rows] * step[..., 1]
-            for step in (back, side)
-        ]
-        good = there & self.inside[rows] & np.isfinite(changes[0])
-        along, across = (np.where(good, change, 0.0) for change in changes)
-        middle = back.shape[1] // 2
-        steps = np.stack([back[:, middle], side[:, middle]], axis=2)
-        return Samples(
-            values, along, across, np.where(good, self.weight[rows], 0.0), np.nan_to_num(steps)
+            self.level.spline, (y, x), order=3, mode="mirror", prefilter=False, output=np.float32
         )
+        slope_x, slope_y = self.slopes[0][rows], self.slopes[1][rows]
+        along, across = (
+            np.where(good, slope_x * step[:, 0] + slope_y * step[:, 1], np.float32(0.0))
+            for step in (back, side)
+        )
+        middle = back.shape[2] // 2
+        steps = np.stack([back[:, :, middle], side[:, :, middle]], axis=2)
+        weight = np.where(good, self.weight[rows], np.float32(0.0))
+        return Samples(values, along, across, weight, np.nan_to_num(steps.astype(np.float64)))
 
     def _step(self, rows: IntArray, *, with_gain: bool) -> None:
         state = self.state
@@ -266,7 +274,8 @@ class _Fit:
                 self.grey[rows], sampled.values, sampled.weight
             )
         system = self._system(rows, sampled)
-        move = np.linalg.solve(system.normal, system.right[:, :, None])[:, :, 0]
+        inverse = np.linalg.inv(system.normal)
+        move = (inverse @ system.right[:, :, None])[:, :, 0]
         limit = LONGEST_PX * self.mapping.scale
         shift = np.clip(move[:, 0], -limit, limit)
         # a limited step keeps its direction
@@ -281,35 +290,32 @@ class _Fit:
         # a turn of the plane moves the rim of the window, at one sigma, while its middle stays
         rim = SIGMA_SHARE * self.mapping.offset[-1, 0] * self.mapping.scale
         state.last[rows] = np.abs(shift) + rim * np.linalg.norm(move[:, 1:3], axis=1)
+        state.still[rows] = STILL_SHARE * system.spread * np.sqrt(np.maximum(inverse[:, 0, 0], 0.0))
 
     def _system(self, rows: IntArray, sampled: Samples) -> System:
         """Return the normal equations."""
         state, weight = self.state, sampled.weight
-        grey, gain = self.grey[rows], state.gain[rows, None]
-        error = sampled.values - gain * grey - state.offset[rows, None]
+        grey, gain = self.grey[rows], state.gain[rows, None].astype(np.float32)
+        error = sampled.values - gain * grey - state.offset[rows, None].astype(np.float32)
         usual = spread(error, weight)
         # at a steep edge a small shift makes a large residual, and that is what is to be found
-        gross = GROSS * np.hypot(usual[:, None], self._shifted(rows) * gain)
+        gross = GROSS * np.hypot(usual[:, None].astype(np.float32), self._shifted(rows) * gain)
         trust = weight / (1 + (error / gross) ** 2) ** 2
-        gained = gain * sampled.along
-        x, y = self.offset.T
-        basis = np.stack(
-            [gained, gained * x, gained * y, -grey, -np.ones_like(grey), gain * sampled.across],
-            axis=2,
-        )
-        weighted = basis * trust[:, :, None]
-        normal = weighted.transpose(0, 2, 1) @ basis
-        right = -np.einsum("npk,np->nk", weighted, error)
+        along, across = gain * sampled.along, gain * sampled.across
+        normal = squares(trust, along, grey, across, self.place)
         # both images being equally noisy; far from the match the residuals are no noise
         settled = state.last[rows] < SETTLED_PX * self.mapping.scale
         noise = usual**2 * gain[:, 0] ** 2 / (1 + gain[:, 0] ** 2) * settled
-        normal -= noise_part(normal, trust, noise, sampled.steps, self.offset)
+        normal -= noise_part(normal, trust, noise, sampled.steps, self.place)
         prior = self._prior(rows) * usual[:, None, None] ** 2
         normal += prior
+        normal += 1e-9 * np.eye(6) * np.trace(normal, axis1=1, axis2=2)[:, None, None]
+        parts = (along, grey, across, self.place, trust, error, prior, weight, usual, gross)
+        system = System(normal, np.empty(0), *parts)
+        right = right_side(system)
         right[:, 1:3] -= np.einsum("nij,nj->ni", prior[:, 1:3, 1:3], state.turned[rows])
         right[:, 5] -= prior[:, 5, 5] * state.across[rows]
-        normal += 1e-9 * np.eye(6) * np.trace(normal, axis1=1, axis2=2)[:, None, None]
-        return System(normal, right, basis, trust, error, prior, weight, usual, gross)
+        return replace(system, right=right)
 
     def _prior(self, rows: IntArray) -> FloatArray:
         """Return what is known beforehand of tilt and shift beside the curve, shape (N, 6, 6)."""
@@ -318,11 +324,11 @@ class _Fit:
         prior[:, 5, 5] = self.beside_precision
         return prior
 
-    def _shifted(self, rows: IntArray) -> FloatArray:
+    def _shifted(self, rows: IntArray) -> NDArray[np.float32]:
         """Return the residuals that a shift as large as the last step would make."""
         last = np.clip(self.state.last[rows] / self.mapping.scale, LEAST_SHIFT_PX, 1.0)
-        slope = np.hypot(self.slopes[0][rows], self.slopes[1][rows])
-        return np.asarray(slope * last[:, None])
+        slope = self.steepness[rows]
+        return np.asarray(slope * last[:, None].astype(np.float32))
 
     def _judged(self) -> Refined:
         state, scale = self.state, self.mapping.scale
@@ -352,7 +358,7 @@ class _Fit:
         variance = np.einsum("np,np->n", trust, system.error**2) / mass
         variance = np.maximum(variance * count / np.maximum(count - 6, 1.0), GREY_VARIANCE)
         # of a shift in any direction: an edge along the curve is steep only across it
-        both = system.basis[:, :, 0] ** 2 + system.basis[:, :, 5] ** 2
+        both = system.along**2 + system.across**2
         steep = np.einsum("np,np->n", trust, both)
         excess = np.maximum(variance - self._noise(np.arange(len(variance))), 0.0)
         # the point itself must lie on the plane too, not only most of what surrounds it

@@ -18,6 +18,9 @@ REACH = 5
 SIGMA = SIGMA_SHARE * REACH
 """Standard deviation of the Gaussian weights, samples."""
 
+SHAPES = 6
+"""Structuring elements that are tried: see `shape_weights`."""
+
 INDEPENDENT = 0.25
 """Independent values per sample: an image in focus is correlated over two pixels in x and y."""
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from closerange.geometry.arrays import FloatArray
 from closerange.matching.window_images import FINER_NOISE
@@ -19,14 +20,17 @@ GREY_VARIANCE = 1 / 12
 """Least variance of a difference of grey values: they are whole numbers."""
 
 
+Pixels = NDArray[np.float32]
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class Samples:
     """Windows as the second image shows them; `steps` are those of the middle, as columns."""
 
-    values: FloatArray
-    along: FloatArray
-    across: FloatArray
-    weight: FloatArray
+    values: Pixels
+    along: Pixels
+    across: Pixels
+    weight: Pixels
     steps: FloatArray
 
 
@@ -35,23 +39,68 @@ class System:
     """Normal equations of windows and what they are made of.
 
     Unknown are the shift along the curve, its change per px in x and y, gain, offset, and the shift
-    across the curve.
+    across the curve. `along`, `grey` and `across` are the derivatives of the error by the first, by
+    minus the fourth and by the last of them.
     """
 
     normal: FloatArray
     right: FloatArray
-    basis: FloatArray
-    trust: FloatArray
-    error: FloatArray
+    along: Pixels
+    grey: Pixels
+    across: Pixels
+    place: Pixels
+    trust: Pixels
+    error: Pixels
     prior: FloatArray
-    weight: FloatArray
+    weight: Pixels
     spread: FloatArray
-    gross: FloatArray
+    gross: Pixels
 
 
-def gain_and_offset(
-    grey: FloatArray, values: FloatArray, weight: FloatArray
-) -> tuple[FloatArray, FloatArray]:
+def squares(
+    weight: Pixels, along: Pixels, grey: Pixels, across: Pixels, place: Pixels
+) -> FloatArray:
+    """Return the weighted sums of the products of all derivatives, shape (N, 6, 6).
+
+    Parameters
+    ----------
+    weight : ndarray of float32, shape (N, P)
+        Of the pixels.
+    along, grey, across : ndarray of float32, shape (N, P)
+        As `System` has them.
+    place : ndarray of float32, shape (P, 6)
+        1, x, y, x x, x y, y y of the pixels.
+    """
+    result = np.empty((len(weight), 6, 6))
+    by_along, by_across, by_grey = weight * along, weight * across, weight * grey
+    second = (by_along * along) @ place
+    result[:, 0, :3] = second[:, :3]
+    result[:, 1, 1:3], result[:, 2, 2] = second[:, 3:5], second[:, 5]
+    result[:, :3, 3] = -((by_along * grey) @ place[:, :3])
+    result[:, :3, 4] = -(by_along @ place[:, :3])
+    result[:, :3, 5] = (by_along * across) @ place[:, :3]
+    result[:, 3, 3] = np.einsum("np,np->n", by_grey, grey)
+    result[:, 3, 4], result[:, 4, 4] = by_grey.sum(axis=1), weight.sum(axis=1)
+    result[:, 3, 5] = -np.einsum("np,np->n", by_grey, across)
+    result[:, 4, 5] = -by_across.sum(axis=1)
+    result[:, 5, 5] = np.einsum("np,np->n", by_across, across)
+    row, column = np.tril_indices(6, -1)
+    result[:, row, column] = result[:, column, row]
+    return result
+
+
+def right_side(system: System) -> FloatArray:
+    """Return the right side of the normal equations but for the priors, shape (N, 6)."""
+    result = np.empty((len(system.error), 6))
+    drawn = system.trust * system.error
+    result[:, :3] = -((drawn * system.along) @ system.place[:, :3])
+    result[:, 3] = np.einsum("np,np->n", drawn, system.grey)
+    result[:, 4] = drawn.sum(axis=1)
+    result[:, 5] = -np.einsum("np,np->n", drawn, system.across)
+    return result
+
+
+def gain_and_offset(grey: Pixels, values: Pixels, weight: Pixels) -> tuple[FloatArray, FloatArray]:
     """Return gain and offset of a straight-line fit of values over grey, shape (N,) each."""
     total = np.maximum(weight.sum(axis=1), 1e-12)
     mean_1 = np.einsum("np,np->n", weight, grey) / total
@@ -63,15 +112,18 @@ def gain_and_offset(
     # a start a pixel off has little correlation: the ratio of contrasts is the better gain
     ratio = np.sqrt(other / np.maximum(own, 1e-12))
     gain = np.clip(np.maximum(shared / np.maximum(own, 1e-12), 0.5 * ratio), 0.05, 20.0)
-    return gain, mean_2 - gain * mean_1
+    return gain.astype(np.float64), (mean_2 - gain * mean_1).astype(np.float64)
 
 
-def spread(error: FloatArray, weight: FloatArray) -> FloatArray:
+def spread(error: Pixels, weight: Pixels) -> FloatArray:
     """Return the standard deviation of the residuals, blind to the worse half, shape (N,)."""
     counted = weight > 0.1
-    size = np.where(counted, np.abs(error), np.nan)
-    size[~counted.any(axis=1)] = 1.0
-    middle = 1.4826 * np.nanmedian(size, axis=1)
+    ordered = np.sort(np.where(counted, np.abs(error), np.float32(np.inf)), axis=1)
+    count = counted.sum(axis=1)
+    rows = np.arange(len(error))
+    lower, upper = (ordered[rows, np.maximum(n, 0) // 2] for n in (count - 1, count))
+    upper = np.where(np.isfinite(upper), upper, lower)
+    middle = np.where(count > 0, 1.4826 * 0.5 * (lower.astype(np.float64) + upper), 1.0)
     return np.asarray(np.maximum(middle, np.sqrt(GREY_VARIANCE)))
 
 
@@ -83,10 +135,10 @@ def inverse_covariance(matrix: FloatArray) -> FloatArray:
 
 def noise_part(
     normal: FloatArray,
-    trust: FloatArray,
+    trust: Pixels,
     variance: FloatArray,
     steps: FloatArray,
-    offset: FloatArray,
+    place: Pixels,
 ) -> FloatArray:
     """Return what the noise in the derivatives of the first image adds to the squares.
 
@@ -102,12 +154,11 @@ def noise_part(
         Of the noise of the first image's pixels, in grey values of the second.
     steps : ndarray, shape (N, 2, 2)
         Columns: the steps in the first image that shifts along and across the curve make.
-    offset : ndarray, shape (P, 2)
-        Pixels from the middle of the window, px of the images.
+    place : ndarray, shape (P, 6)
+        1, x, y, x x, x y, y y of the pixels from the middle of the window, px of the images.
     """
-    x, y = offset.T
-    place = np.stack([np.ones_like(x), x, y], axis=1)
-    moments = np.einsum("np,pa,pb->nab", trust, place, place)
+    sums = trust @ place
+    moments = sums[:, [[0, 1, 2], [1, 3, 4], [2, 4, 5]]]
     products = FINER_NOISE * variance[:, None, None] * steps.transpose(0, 2, 1) @ steps
     part = np.zeros_like(normal)
     part[:, :3, :3] = products[:, :1, :1] * moments
@@ -128,13 +179,12 @@ def shift_std(system: System) -> FloatArray:
     far = (error / system.gross) ** 2
     slope = np.einsum("np,np->n", weight, (1 - 3 * far) / (1 + far) ** 3)
     slope = np.maximum(slope / np.maximum(trust.sum(axis=1), 1e-12), LEAST_SLOPE)
-    squares = np.maximum((trust**2).sum(axis=1), 1e-12)
-    count = np.maximum(trust.sum(axis=1), 1e-12) ** 2 / squares
-    variance = np.einsum("np,np->n", trust**2, error**2) / squares / slope**2
+    doubled = np.maximum((trust**2).sum(axis=1), 1e-12)
+    count = np.maximum(trust.sum(axis=1), 1e-12) ** 2 / doubled
+    variance = np.einsum("np,np->n", trust**2, error**2) / doubled / slope**2
     variance = np.maximum(variance, GREY_VARIANCE) * count / np.maximum(count - 6, 1.0)
     inverse = np.linalg.inv(system.normal)
-    doubled = system.basis * trust[:, :, None]
-    middle = doubled.transpose(0, 2, 1) @ doubled
+    middle = squares(trust**2, system.along, system.grey, system.across, system.place)
     middle *= (_alike(system) * variance)[:, None, None]
     middle += system.prior * system.spread[:, None, None] ** 2
     cov = inverse @ middle @ inverse

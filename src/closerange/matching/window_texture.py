@@ -8,13 +8,19 @@ import numpy as np
 
 from closerange.flags import Flag
 from closerange.geometry.arrays import BoolArray, FloatArray, IntArray
-from closerange.matching.pencil import Pencil
-from closerange.matching.search import epipolar_segment
-from closerange.matching.window_candidates import Places, find_places, start_level
+from closerange.matching.window_candidates import (
+    HOPELESS,
+    Places,
+    choose_places,
+    find_places,
+    start_level,
+)
 from closerange.matching.window_images import ImagePair, clipped_share
 from closerange.matching.window_planes import SeedRays, tilt_hypotheses
 from closerange.matching.window_refine import Refined, refine_windows
 from closerange.matching.window_scores import REACH
+from closerange.matching.window_search import Search, segment_omegas, swept_level
+from closerange.matching.window_sweep import Sweep
 
 RETURN_PX = 1.5
 """A match, matched back, must return to within this, as for edge matches."""
@@ -78,41 +84,36 @@ class Found:
             getattr(self, item.name)[rows] = getattr(part, item.name)
 
 
-def match_textured(
-    pencil: Pencil,
-    pair: ImagePair,
-    rays: SeedRays,
-    omega: FloatArray,
-    size: IntArray,
-    volume_mm: FloatArray,
-    epipolar_px: float,
-) -> Found:
+def match_textured(search: Search, rays: SeedRays, size: IntArray, rows: IntArray) -> Found:
     """Match points by the texture around them.
 
     Parameters
     ----------
-    pencil : Pencil
-        Of the two cameras.
-    pair : ImagePair
-        Both images.
+    search : Search
+        Views and limits.
     rays : SeedRays
-        N points of the first view.
-    omega : ndarray, shape (N, K)
-        Inverse depths a px apart along their epipolar segments.
+        N points of the first view, all with a segment to be searched.
     size : ndarray of int, shape (N,)
         Half-widths of their windows, px.
-    volume_mm : ndarray, shape (2, 3)
-        Measuring volume.
-    epipolar_px : float
-        Standard deviation of the epipolar curves.
+    rows : ndarray of int, shape (N,)
+        Their rows in the sweep.
 
     Returns
     -------
     Found
         One row for each point.
     """
-    places = _places(pencil, pair, rays, omega, size, backward=False)
-    best, rival = (_refined(pair, rays, places, size, column, epipolar_px) for column in (0, 1))
+    pair = search.pair
+    if search.there is None:
+        omega, _ = segment_omegas(search.pencil, rays, search.volume_mm)
+        places = _places(search, rays, omega, size, backward=False)
+    else:
+        places = _swept_places(search, rays, search.there.select(rows))
+    best = _refined(pair, rays, places, size, 0, search.epipolar_px)
+    # a rival that is behind by far on all levels stays there
+    rival = _refined(
+        pair, rays, places, np.where(places.evidence < HOPELESS, size, 0), 1, search.epipolar_px
+    )
     evidence, best = _better(rays, places, best, rival)
     held = _held(rays, places, best)
     width = size.astype(np.float64)
@@ -123,7 +124,7 @@ def match_textured(
         clipped_share(pair.greys[0], rays.xy_px, width), clipped_share(pair.greys[1], there, width)
     )
     lost = ~np.isfinite(held.omega)
-    returns = _returns(pencil, pair, rays, held.omega, size, volume_mm)
+    returns = _returns(search, rays, held.omega, size)
     with np.errstate(invalid="ignore"):
         for flag, where in (
             (Flag.not_found, lost),
@@ -139,34 +140,6 @@ def match_textured(
     return found
 
 
-def segment_omegas(
-    pencil: Pencil, rays: SeedRays, volume_mm: FloatArray
-) -> tuple[FloatArray, IntArray]:
-    """Return inverse depths a px apart along the epipolar segments, and why there are none.
-
-    Parameters
-    ----------
-    pencil : Pencil
-        Of the two cameras.
-    rays : SeedRays
-        N points.
-    volume_mm : ndarray, shape (2, 3)
-        Measuring volume.
-
-    Returns
-    -------
-    omega : ndarray, shape (N, K)
-        NaN after the last of each segment.
-    flags : ndarray of int, shape (N,)
-        Those of `EpipolarSegments`.
-    """
-    segments = epipolar_segment(pencil.first, pencil.second, rays.xy_px, volume_mm)
-    length = np.linalg.norm(rays.ray, axis=1)[:, None]
-    with np.errstate(divide="ignore", invalid="ignore"):
-        omega = length / segments.distance_mm
-    return np.where(np.isfinite(omega), omega, np.nan), segments.flags.copy()
-
-
 def refining_scale(half_width: int) -> int:
     """Return how many times smaller the images are in which so large a window is refined.
 
@@ -176,28 +149,30 @@ def refining_scale(half_width: int) -> int:
     return 1 << max((half_width - 1) // 20, 0).bit_length()
 
 
+def _swept_places(search: Search, rays: SeedRays, swept: tuple[FloatArray, FloatArray]) -> Places:
+    """Choose among the places that a sweep of the image has found."""
+    tilts = tilt_hypotheses(rays, swept[0][:, 0], REACH)
+    images = search.pair.pyramids(swept_level(search.pair))
+    return choose_places(rays, *swept, images, tilts, search.others)
+
+
 def _places(
-    pencil: Pencil,
-    pair: ImagePair,
-    rays: SeedRays,
-    omega: FloatArray,
-    size: IntArray,
-    *,
-    backward: bool,
+    search: Search, rays: SeedRays, omega: FloatArray, size: IntArray, *, backward: bool
 ) -> Places:
     """Sweep along the segments, beginning where eleven samples cover the window."""
     tilts = tilt_hypotheses(rays, np.nanmedian(omega, axis=1), REACH)
     samples = int(np.quantile(np.isfinite(omega).sum(axis=1), 0.9))
-    side = min(min(camera.size_px) for camera in (pencil.first, pencil.second))
+    side = min(min(camera.size_px) for camera in (rays.first, rays.second))
     least = start_level(samples, len(tilts), (side, side))
     wanted = np.log2(np.maximum(size, REACH) / REACH).astype(np.int64)
     level = np.maximum(least, wanted)
     result = Places.empty(len(rays))
     for top in np.unique(level):
         rows = np.flatnonzero(level == top)
-        here, there = pair.pyramids(int(top))
+        here, there = search.pair.pyramids(int(top))
         images = (there, here) if backward else (here, there)
-        result.put(rows, find_places(rays.select(rows), omega[rows], images, tilts))
+        found = find_places(rays.select(rows), omega[rows], images, tilts, search.others)
+        result.put(rows, found)
     return result
 
 
@@ -211,7 +186,7 @@ def _refined(
 ) -> Refined:
     """Refine the best (column 0) or the second-best places."""
     result = Refined.empty(len(rays))
-    for width in np.unique(size):
+    for width in np.unique(size[size > 0]):
         rows = np.flatnonzero((size == width) & np.isfinite(places.omega[:, column]))
         if not rows.size:
             continue
@@ -228,31 +203,39 @@ def _refined(
     return result
 
 
-def _returns(
-    pencil: Pencil,
-    pair: ImagePair,
-    rays: SeedRays,
-    omega: FloatArray,
-    size: IntArray,
-    volume_mm: FloatArray,
-) -> BoolArray:
+def _returns(search: Search, rays: SeedRays, omega: FloatArray, size: IntArray) -> BoolArray:
     """Mark matches that, matched back, come to their points again."""
     result = np.zeros(len(rays), dtype=bool)
     rows = np.flatnonzero(np.isfinite(omega))
     some = rays.select(rows)
-    back = pencil.reversed()
+    back = search.pencil.reversed()
     there = SeedRays.of(back, rays.second.project(some.at(omega[rows])))
-    span, flags = segment_omegas(back, there, volume_mm)
+    if search.back is not None:
+        result[rows] = _swept_home(search.back, there, some.xy_px)
+        return result
+    span, flags = segment_omegas(back, there, search.volume_mm)
     good = np.flatnonzero((flags == 0) & np.isfinite(span).any(axis=1))
     if not good.size:
         return result
     rows, there = rows[good], there.select(good)
-    places = _places(back, pair, there, span[good], size[rows], backward=True)
+    places = _places(search, there, span[good], size[rows], backward=True)
     home = rays.first.project(there.at(places.omega[:, 0])) - rays.xy_px[rows]
     # large windows are swept where they are eleven samples wide, to half a sample
     near = np.maximum(RETURN_PX, size[rows] / (2 * REACH))
     with np.errstate(invalid="ignore"):
         result[rows] = np.linalg.norm(home, axis=1) < near
+    return result
+
+
+def _swept_home(back: Sweep, there: SeedRays, xy_px: FloatArray) -> BoolArray:
+    """Mark points that one of the pixels around their match, swept back, comes near to."""
+    # a swept place is good to half a plane, and the pixels around are as far away
+    near = RETURN_PX + back.scale / 2
+    result = np.zeros(len(there), dtype=bool)
+    for omega in back.near(there.xy_px).T:
+        with np.errstate(invalid="ignore"):
+            home = there.second.project(there.at(omega)) - xy_px
+            result |= np.linalg.norm(home, axis=1) < near
     return result
 
 
