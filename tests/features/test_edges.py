@@ -7,7 +7,16 @@ import numpy as np
 import pytest
 
 from closerange.errors import InputError
-from closerange.features.edge_chains import chain_numbers, chain_places, chain_window, link_edges
+from closerange.features.edge_chains import (
+    AHEAD,
+    REACH_PX,
+    SAME_WAY,
+    chain_line,
+    chain_numbers,
+    chain_places,
+    chain_window,
+    link_edges,
+)
 from closerange.features.edges import find_edges
 from closerange.features.grey_noise import noise_curve
 
@@ -118,6 +127,43 @@ def test_places_windows_and_links_by_hand():
     assert before.tolist() == [-1, 0, 1, 2, 3, 4, 5, 6, 7, 8]
     gone = link_edges(np.zeros((0, 2)), np.zeros((0, 2)), (30, 20))
     assert [len(part) for part in gone] == [0, 0]
+
+
+def test_links_are_the_cheapest_of_all_pairs_tried_one_by_one():
+    """Scattered points with random normals, in cells of a pixel, against the rule itself."""
+    rng = np.random.default_rng(8)
+    xy = rng.permutation(np.argwhere(np.ones((16, 16))))[:90] + rng.uniform(-0.4, 0.4, (90, 2))
+    turn = rng.uniform(-0.6, 0.6, 90)
+    normal = np.column_stack([np.sin(turn), -np.cos(turn)])
+    tangent = np.column_stack([-normal[:, 1], normal[:, 0]])
+    best = np.full((2, 90), -1)
+    for i in range(90):
+        least = [np.inf, np.inf]
+        for j in range(90):
+            step = xy[j] - xy[i]
+            near = (np.abs(np.rint(xy[j]) - np.rint(xy[i])) <= REACH_PX).all()
+            if i == j or not near or normal[i] @ normal[j] <= SAME_WAY:
+                continue
+            distance = np.linalg.norm(step)
+            ahead = step @ tangent[i] / distance
+            cost = distance + abs(step @ normal[i]) + abs(step @ normal[j])
+            side = int(ahead < 0)
+            if abs(ahead) > AHEAD and cost < least[side]:
+                least[side], best[side, i] = cost, j
+    wanted = [j if j >= 0 and best[1, j] == i else -1 for i, j in enumerate(best[0])]
+    after, before = link_edges(xy, normal, (16, 16))
+    assert after.tolist() == wanted
+    assert (after >= 0).sum() > 20
+    linked = np.flatnonzero(after >= 0)
+    np.testing.assert_array_equal(before[after[linked]], linked)
+
+
+def test_a_line_of_chains_by_hand():
+    after = np.array([4, -1, 5, 1, 3, 2, -1])  # 0 4 3 1, closed 2 5, single 6
+    order, end = chain_line(after)
+    assert order.tolist() == [0, 4, 3, 1, 6, 2, 5]
+    assert end.tolist() == [4, 5, 7]
+    assert [part.tolist() for part in chain_line(np.zeros(0, np.int64))] == [[], []]
 
 
 def test_the_noise_curve_follows_shot_noise():

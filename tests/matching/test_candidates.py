@@ -6,6 +6,8 @@ import numpy as np
 import pytest
 
 from closerange.features.edges import find_edges
+from closerange.matching import candidates as candidates_module
+from closerange.matching import pencil as pencil_module
 from closerange.matching.candidates import find_candidates, sweep_axis
 from closerange.matching.pencil import Pencil
 
@@ -37,9 +39,42 @@ def test_candidates_lie_in_the_volume_on_the_chain_and_are_sorted(found, box_sce
     after = edges[1].after[candidates.link]
     assert (after >= 0).all()
     a, b = edges[1].xy_px[candidates.link], edges[1].xy_px[after]
-    np.testing.assert_allclose(
-        candidates.xy_px, a + candidates.share[:, None] * (b - a), atol=1e-12
-    )
+    np.testing.assert_allclose(candidates.xy_px, a + candidates.share[:, None] * (b - a), atol=1e-4)
+
+
+@pytest.mark.parametrize("across", [np.inf, 12.0])
+def test_no_crossing_is_missed(found, across):
+    """Every ninth point against all pieces of chain, one by one."""
+    pencil, (first, second), _ = found
+    volume = np.array([[-across, -across, -30.0], [across, across, 25.0]])
+    candidates = find_candidates(pencil, first, second, volume)
+    theta, slope = pencil.coordinates(pencil.first, first.xy_px)
+    theta_2, slope_2 = pencil.coordinates(pencil.second, second.xy_px)
+    link = np.flatnonzero(second.after >= 0)
+    after = second.after[link]
+    for point in range(0, len(first), 9):
+        share = (theta[point] - theta_2[link]) / (theta_2[after] - theta_2[link])
+        rise = theta[first.after[point]] - theta[point] if first.after[point] >= 0 else 0.0
+        rise += theta[point] - theta[first.before[point]] if first.before[point] >= 0 else 0.0
+        crossed = (share >= 0) & (share <= 1) & (rise * (theta_2[after] - theta_2[link]) > 0)
+        met = (slope_2[link] + share * (slope_2[after] - slope_2[link]))[crossed]
+        one = np.ones(len(met))
+        xyz = pencil.point(theta[point] * one, slope[point] * one, met)
+        inside = ((xyz >= volume[0]) & (xyz <= volume[1])).all(axis=1)
+        wanted = link[crossed][inside]
+        assert sorted(candidates.link[candidates.point == point]) == sorted(wanted)
+
+
+def test_pieces_of_the_work_make_no_difference(found, box_scene, monkeypatch):
+    pencil, edges, whole = found
+    monkeypatch.setattr(candidates_module, "PAIRS_AT_ONCE", 100)
+    monkeypatch.setattr(candidates_module, "ROWS_AT_ONCE", 33)
+    monkeypatch.setattr(pencil_module, "AT_ONCE", 77)
+    pieces = find_candidates(pencil, *edges, box_scene.rig.volume_mm)
+    np.testing.assert_array_equal(pieces.point, whole.point)
+    np.testing.assert_array_equal(pieces.link, whole.link)
+    np.testing.assert_allclose(pieces.xyz_mm, whole.xyz_mm, atol=1e-9)
+    np.testing.assert_allclose(pieces.level, whole.level, atol=1e-6)
 
 
 def test_the_bright_side_is_the_same_along_the_epipolar_curve(found):

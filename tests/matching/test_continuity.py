@@ -8,9 +8,11 @@ import numpy as np
 import pytest
 
 from closerange.features.edges import EdgePoints
+from closerange.matching import continuity
 from closerange.matching.candidates import Candidates
 from closerange.matching.continuity import (
     CHANGE,
+    MOST_CANDIDATES,
     NEIGHBOUR_PLACES,
     NEIGHBOUR_PRICE,
     NO_MATCH,
@@ -104,6 +106,24 @@ def test_the_choice_is_the_cheapest_of_all(seed):
             assert chosen.lead[p] == pytest.approx(lead, abs=1e-4)
             assert chosen.cost[p] == pytest.approx(cost[best], abs=1e-6)
         start += length
+
+
+def test_blocks_and_crowded_points_make_no_difference(monkeypatch):
+    """Twenty chains worked on together and one by one; some points have too many candidates."""
+    rng = np.random.default_rng(3)
+    lengths = rng.integers(1, 300, 20).tolist()
+    counts = rng.integers(0, 4, sum(lengths))
+    counts[::50] = MOST_CANDIDATES + 5
+    edges, candidates = chain_of(lengths), candidates_of(rng, counts)
+    cost = rng.uniform(0, 4, len(candidates))
+    whole = choose(edges, candidates, cost, 2)
+    monkeypatch.setattr(continuity, "AT_ONCE", 1)
+    single = choose(edges, candidates, cost, 2)
+    for name in ("candidate", "matched", "margin", "cost", "lead"):
+        np.testing.assert_array_equal(getattr(single, name), getattr(whole, name))
+    for point in range(0, len(counts), 50):
+        rows = np.flatnonzero(candidates.point == point)
+        assert (cost[rows] < cost[whole.candidate[point]]).sum() < MOST_CANDIDATES
 
 
 def test_a_chain_longer_than_a_piece_is_one_chain():

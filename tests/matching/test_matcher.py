@@ -37,11 +37,14 @@ def truth(scene, seeds):
 
 
 def test_nearly_all_edges_are_found_and_what_is_kept_is_right(matches, box_scene):
-    """Within 1 px: 91 % of what has a place, all of what has no flag (97 % within 0.1 px)."""
+    """Within 1 px: 82 % of what has a place, all of what has no flag (97 % within 0.1 px).
+
+    Points that no other view shows keep their best guess too, flagged.
+    """
     error = np.linalg.norm(matches.xy_px[:, 1] - truth(box_scene, matches.xy_px[:, 0]), axis=1)
     found, clean = matches.found[:, 1], matches.clean
     assert len(matches) > 800
-    assert (error[found] < 1.0).mean() > 0.85
+    assert (error[found] < 1.0).mean() > 0.75
     assert clean.mean() > 0.55
     assert (error[clean] < 1.0).mean() >= 0.99
     assert (error[clean] < 0.1).mean() > 0.9
@@ -167,6 +170,7 @@ def test_a_third_view_adds_a_column_and_agrees(shared):
     three = match_views(views_of(cameras, images), volume)
     assert three.cameras == names
     assert three.clean.mean() > 0.4
+    assert np.nanmin(three.mismatch) >= 0, "a table of matches holds no negative misfit"
     both = (three.flags == 0).all(axis=1)
     assert both.sum() > 500
     xyz, _ = intersect(three.xy_px[both], cameras)

@@ -36,29 +36,81 @@ def link_edges(
         Row of the next and of the previous point, or -1.
     """
     count = len(xy_px)
-    follower = [np.full(count, -1, dtype=np.int64) for _ in range(2)]
     if count == 0:
-        return follower[0], follower[1]
-    tangent = np.column_stack([-normal[:, 1], normal[:, 0]])
+        return np.full(0, -1, dtype=np.int64), np.full(0, -1, dtype=np.int64)
     first, second = _neighbours(xy_px, size_px)
-    step = xy_px[second] - xy_px[first]
-    distance = np.maximum(np.linalg.norm(step, axis=1), 1e-9)
-    ahead = _dot(step, tangent[first]) / distance
+    (x, y), (across, down) = np.ascontiguousarray(xy_px.T), np.ascontiguousarray(normal.T)
+    same = across[first] * across[second] + down[first] * down[second] > SAME_WAY
+    first, second = first[same], second[same]
+    step_x, step_y = x[second] - x[first], y[second] - y[first]
+    distance = np.maximum(np.sqrt(step_x * step_x + step_y * step_y), 1e-9)
+    ahead = (step_y * across[first] - step_x * down[first]) / distance
     # both tangents should lie along the way between the two points
-    bend = np.abs(_dot(step, normal[first])) + np.abs(_dot(step, normal[second]))
+    bend = np.abs(step_x * across[first] + step_y * down[first])
+    bend += np.abs(step_x * across[second] + step_y * down[second])
     cost = distance + bend
-    same = (_dot(normal[first], normal[second]) > SAME_WAY) & (np.abs(ahead) > AHEAD)
-    for side, mask in enumerate((same & (ahead > 0), same & (ahead < 0))):
-        rows = np.flatnonzero(mask)
-        rows = rows[np.lexsort((cost[rows], first[rows]))]
-        best = rows[np.r_[True, np.diff(first[rows]) > 0]] if rows.size else rows
-        follower[side][first[best]] = second[best]
-    after, before = follower
+    after = _best(count, np.flatnonzero(ahead > AHEAD), (first, second), cost)
+    before = _best(count, np.flatnonzero(ahead < -AHEAD), (first, second), cost)
     mutual = (after >= 0) & (before[after] == np.arange(count))
     after = np.where(mutual, after, -1)
     before = np.full(count, -1, dtype=np.int64)
     before[after[mutual]] = np.flatnonzero(mutual)
     return after, before
+
+
+def _best(
+    count: int, rows: IntArray, pairs: tuple[IntArray, IntArray], cost: FloatArray
+) -> IntArray:
+    """Return the other point of the cheapest of some pairs of each point, or -1."""
+    first, second, price = pairs[0][rows], pairs[1][rows], cost[rows]
+    least = np.full(count, np.inf)
+    np.minimum.at(least, first, price)
+    cheapest = np.flatnonzero(price == least[first])[::-1]
+    best = np.full(count, -1, dtype=np.int64)
+    best[first[cheapest]] = second[cheapest]  # of equal ones the first, which is written last
+    return best
+
+
+def chain_line(after: IntArray) -> tuple[IntArray, IntArray]:
+    """Lay out all points in one row, chain after chain.
+
+    Parameters
+    ----------
+    after : ndarray of int, shape (N,)
+        The next point, or -1; no two have the same.
+
+    Returns
+    -------
+    order : ndarray of int, shape (N,)
+        The points. Open chains come first, by their first points; a closed chain starts at its
+        first point in the order of rows.
+    end : ndarray of int, shape (C,)
+        Where in that order each chain ends.
+    """
+    count = len(after)
+    headless = np.ones(count, dtype=bool)
+    headless[after[after >= 0]] = False
+    following = after.tolist()
+    order: list[int] = []
+    end: list[int] = []
+    add = order.append
+    for start in np.flatnonzero(headless).tolist():
+        point = start
+        while point >= 0:
+            add(point)
+            point = following[point]
+        end.append(len(order))
+    rest = np.ones(count, dtype=bool)
+    rest[order] = False
+    for start in np.flatnonzero(rest).tolist():
+        point = start
+        while rest[point]:
+            rest[point] = False
+            order.append(point)
+            point = following[point]
+        if not end or end[-1] < len(order):
+            end.append(len(order))
+    return np.array(order, dtype=np.int64), np.array(end, dtype=np.int64)
 
 
 def chain_numbers(after: IntArray) -> IntArray:
@@ -80,23 +132,12 @@ def chain_places(after: IntArray) -> tuple[IntArray, IntArray]:
         Number of the chain and number within it, both from 0; a closed chain starts at its
         first point in the order of rows.
     """
-    count = len(after)
-    chain, place = np.full(count, -1, dtype=np.int64), np.zeros(count, dtype=np.int64)
-    following = after.tolist()
-    headless = np.ones(count, dtype=bool)
-    headless[after[after >= 0]] = False
-    starts = [*np.flatnonzero(headless).tolist(), *range(count)]
-    number = 0
-    names, places = chain.tolist(), place.tolist()
-    for start in starts:
-        if names[start] >= 0:
-            continue
-        point, position = start, 0
-        while point >= 0 and names[point] < 0:
-            names[point], places[point] = number, position
-            point, position = following[point], position + 1
-        number += 1
-    return np.array(names, dtype=np.int64), np.array(places, dtype=np.int64)
+    order, end = chain_line(after)
+    length = np.diff(end, prepend=0)
+    chain, place = np.empty_like(order), np.empty_like(order)
+    chain[order] = np.repeat(np.arange(len(end)), length)
+    place[order] = np.arange(len(order)) - np.repeat(end - length, length)
+    return chain, place
 
 
 def chain_window(after: IntArray, before: IntArray, reach: int) -> IntArray:
@@ -137,8 +178,3 @@ def _neighbours(xy_px: FloatArray, size_px: tuple[int, int]) -> tuple[IntArray, 
     first, second = np.concatenate(pairs_first), np.concatenate(pairs_second)
     apart = first != second
     return order[first[apart]], order[second[apart]]
-
-
-def _dot(a: FloatArray, b: FloatArray) -> FloatArray:
-    product: FloatArray = np.einsum("ni,ni->n", a, b)
-    return product

@@ -146,6 +146,15 @@ def find_edges(
             remedy="convert colour images to grey; use whole images",
         )
     grey = grey.astype(np.float32)
+    # what is made of the whole image on the way is gone before the next is made: memory
+    every = _significant(grey, scale_px, significance)
+    found = every.select(_long(every.after, shortest))
+    drift = _drift(grey, found, WIDE * scale_px)
+    return replace(found, model_px=model_std(found.strength, found.width_px2, drift, found.after))
+
+
+def _significant(grey: NDArray[np.float32], scale_px: float, significance: float) -> EdgePoints:
+    """Return all edge points that noise does not explain, without the uncertainty of the model."""
     level = cv2.blur(grey, (WINDOW_PX, WINDOW_PX))
     curve = noise_curve(grey, level)
     slope = _gradient(grey, scale_px)
@@ -162,12 +171,8 @@ def find_edges(
     noise_px = second * noise * width / strength
     size_px = (grey.shape[1], grey.shape[0])
     chains = link_edges(xy_px, normal, size_px)
-    long = _long(chains[0], shortest)
-    found = EdgePoints(
-        xy_px, normal, strength, width, noise_px, np.zeros(len(row)), *chains, size_px
-    ).select(long)
-    drift = _drift(grey, found, WIDE * scale_px)
-    return replace(found, model_px=model_std(found.strength, found.width_px2, drift, found.after))
+    none = np.zeros(len(row))
+    return EdgePoints(xy_px, normal, strength, width, noise_px, none, *chains, size_px)
 
 
 def _gradient(grey: NDArray[np.float32], scale_px: float) -> tuple[NDArray[np.float32], ...]:

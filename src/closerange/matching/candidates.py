@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass, fields
 
 import numpy as np
@@ -14,6 +15,16 @@ from closerange.matching.pencil import Pencil
 
 SHALLOWEST = 1e-3
 """Sine of the angle between edge and epipolar curve below which nothing can be told."""
+
+PAIRS_AT_ONCE = 200_000
+"""Pairs of a point and a piece of chain that are looked at at once: 2 MB for each number."""
+
+ROWS_AT_ONCE = 16_000
+"""Candidates that are described at once. Of more, the products with small matrices are shared out
+between processors, which takes longer than the products where others work too."""
+
+SLACK = 1e-9
+"""Relative width by which the range of slopes is larger than the volume: rounding, far exceeded."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -106,33 +117,116 @@ def find_candidates(
         Sorted by point of the first view.
     """
     theta, slope = pencil.coordinates(pencil.first, first.xy_px)
+    point, link, share, met = _crossings(pencil, (theta, slope), (first, second), volume_mm)
+    track = chain_places(second.after)
+    table = _table(len(point))
+    filled = 0
+    for start in range(0, len(point), ROWS_AT_ONCE):
+        rows = slice(start, start + ROWS_AT_ONCE)
+        xyz_mm = pencil.point(theta[point[rows]], slope[point[rows]], met[rows])
+        with np.errstate(invalid="ignore"):
+            inside = ((xyz_mm >= volume_mm[0]) & (xyz_mm <= volume_mm[1])).all(axis=1)
+        kept = start + np.flatnonzero(inside)
+        crossing = (point[kept], link[kept], share[kept])
+        part = _described(pencil, second, track, crossing, xyz_mm[inside])
+        for item in fields(Candidates):
+            getattr(table, item.name)[filled : filled + len(part)] = getattr(part, item.name)
+        filled += len(part)
+    return Candidates(*(getattr(table, item.name)[:filled] for item in fields(Candidates)))
+
+
+def _table(count: int) -> Candidates:
+    """Return so many rows to be filled in; what is only looked at closely once in short numbers."""
+
+    def numbers(*shape: int) -> FloatArray:
+        return np.empty((count, *shape))
+
+    def short(*shape: int) -> FloatArray:
+        return np.empty((count, *shape), dtype=np.float32)
+
+    return Candidates(
+        point=np.empty(count, np.int64),
+        link=np.empty(count, np.int64),
+        share=numbers(),
+        xy_px=short(2),
+        xyz_mm=numbers(3),
+        tangent=short(2),
+        epipolar=short(2),
+        sine=numbers(),
+        px_per_mm=numbers(),
+        level=short(2, 2),
+        upright_first=short(2),
+        upright_second=short(2),
+        chain=np.empty(count, np.int64),
+        place=numbers(),
+    )
+
+
+def _crossings(
+    pencil: Pencil,
+    rays: tuple[FloatArray, FloatArray],
+    edges: tuple[EdgePoints, EdgePoints],
+    volume_mm: FloatArray,
+) -> tuple[IntArray, IntArray, FloatArray, FloatArray]:
+    """Return point, piece of chain, share of it and slope of the crossings in the volume."""
+    first, second = edges
+    theta, slope = rays
+    lowest, highest = _slopes_within(pencil, theta, slope, volume_mm)
     theta_2, slope_2 = pencil.coordinates(pencil.second, second.xy_px)
+    rise = np.sign(np.where(lowest <= highest, _rise(theta, first), 0.0))
     link = np.flatnonzero(second.after >= 0)
-    start, stop = theta_2[link], theta_2[second.after[link]]
-    point, crossed = _straddled(theta, np.minimum(start, stop), np.maximum(start, stop))
-    rising = np.sign(_rise(theta, first))[point] == np.sign(stop - start)[crossed]
-    point, crossed = point[rising], crossed[rising]
-    link = link[crossed]
-    share = (theta[point] - theta_2[link]) / (stop - start)[crossed]
-    after = second.after[link]
-    met = slope_2[link] + share * (slope_2[after] - slope_2[link])
-    xyz_mm = pencil.point(theta[point], slope[point], met)
-    with np.errstate(invalid="ignore"):
-        inside = ((xyz_mm >= volume_mm[0]) & (xyz_mm <= volume_mm[1])).all(axis=1)
-    rows = np.flatnonzero(inside)
-    rows = rows[np.lexsort((met[rows], point[rows]))]
-    return _described(pencil, second, point[rows], link[rows], share[rows], xyz_mm[rows])
+    climb = theta_2[second.after[link]] - theta_2[link]
+    found = [(np.zeros(0, np.int64), np.zeros(0, np.int64), np.zeros(0), np.zeros(0))]
+    for sign in (1, -1):
+        points = np.flatnonzero(rise == sign)
+        points = points[np.argsort(theta[points], kind="stable")]
+        pieces = link[np.sign(climb) == sign]
+        after = second.after[pieces]
+        start, step = theta_2[pieces], theta_2[after] - theta_2[pieces]
+        ends = (start, theta_2[after])[::sign]
+        for nearby, crossed in _straddled(theta[points], *ends):
+            point, piece = points[nearby], pieces[crossed]
+            share = (theta[point] - start[crossed]) / step[crossed]
+            met = slope_2[piece] + share * (slope_2[after[crossed]] - slope_2[piece])
+            rows = np.flatnonzero((met >= lowest[point]) & (met <= highest[point]))
+            found.append((point[rows], piece[rows], share[rows], met[rows]))
+    point, piece, share, met = (np.concatenate(column) for column in zip(*found, strict=True))
+    order = np.lexsort((met, point))
+    return point[order], piece[order], share[order], met[order]
 
 
-def _straddled(value: FloatArray, low: FloatArray, high: FloatArray) -> tuple[IntArray, IntArray]:
-    """Return all pairs (i, j) with low[j] <= value[i] < high[j]."""
-    order = np.argsort(value, kind="stable")
-    ordered = value[order]
+def _slopes_within(
+    pencil: Pencil, theta: FloatArray, slope: FloatArray, volume_mm: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """Return the least and largest slope of rays of the second camera that meet in the volume.
+
+    The first camera's ray is clipped to the box, as its way across the line between the cameras.
+    """
+    nearest, furthest = np.zeros_like(theta), np.full_like(theta, np.inf)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        for axis in range(3):
+            along, across, upwards = pencil.axes[:, axis]
+            pace = slope * along + np.cos(theta) * across + np.sin(theta) * upwards
+            ends = (volume_mm[:, axis] - pencil.first.centre_mm[axis])[:, None] / pace
+            # NaN is a ray along a wall, which sets no limit
+            nearest = np.fmax(nearest, ends.min(axis=0))
+            furthest = np.fmin(furthest, ends.max(axis=0))
+        lowest = slope - pencil.baseline_mm * (1 + SLACK) / nearest
+        return lowest, slope - pencil.baseline_mm * (1 - SLACK) / furthest
+
+
+def _straddled(
+    ordered: FloatArray, low: FloatArray, high: FloatArray
+) -> Iterator[tuple[IntArray, IntArray]]:
+    """Yield all pairs (i, j) with low[j] <= ordered[i] < high[j], some at a time."""
     start = np.searchsorted(ordered, low, side="left")
     count = np.searchsorted(ordered, high, side="left") - start
-    piece = np.repeat(np.arange(len(low)), count)
-    offset = np.arange(len(piece)) - np.repeat(np.cumsum(count) - count, count)
-    return order[np.repeat(start, count) + offset], piece
+    block = np.cumsum(count) // PAIRS_AT_ONCE
+    for some in np.split(np.arange(len(low)), np.flatnonzero(np.diff(block)) + 1):
+        number = count[some]
+        piece = np.repeat(some, number)
+        offset = np.arange(len(piece)) - np.repeat(np.cumsum(number) - number, number)
+        yield start[piece] + offset, piece
 
 
 def _rise(theta: FloatArray, edges: EdgePoints) -> FloatArray:
@@ -142,14 +236,15 @@ def _rise(theta: FloatArray, edges: EdgePoints) -> FloatArray:
     return np.asarray(ahead + behind)
 
 
-def _described(  # the eight are one row of the table
+def _described(
     pencil: Pencil,
     second: EdgePoints,
-    point: IntArray,
-    link: IntArray,
-    share: FloatArray,
+    track: tuple[IntArray, IntArray],
+    crossing: tuple[IntArray, IntArray, FloatArray],
     xyz_mm: FloatArray,
 ) -> Candidates:
+    """Return all there is to say about crossings; `track` has the chains of the second view."""
+    point, link, share = crossing
     axis = sweep_axis(pencil)
     across = [other for other in range(3) if other != axis]
     by_first = pencil.first.project_jacobian(xyz_mm)
@@ -157,12 +252,10 @@ def _described(  # the eight are one row of the table
     ray = xyz_mm - pencil.first.centre_mm
     moved = np.einsum("nij,nj->ni", by_second, ray / ray[:, axis, None])
     px_per_mm = np.linalg.norm(moved, axis=1)
-    after = second.after[link]
-    step = second.xy_px[after] - second.xy_px[link]
+    step = second.xy_px[second.after[link]] - second.xy_px[link]
     tangent = step / np.linalg.norm(step, axis=1, keepdims=True)
     epipolar = moved / px_per_mm[:, None]
     sine = np.abs(epipolar[:, 0] * tangent[:, 1] - epipolar[:, 1] * tangent[:, 0])
-    chain, place = chain_places(second.after)
     return Candidates(
         point=point,
         link=link,
@@ -176,8 +269,8 @@ def _described(  # the eight are one row of the table
         level=by_second[:, :, across] @ _inverse(by_first[:, :, across]),
         upright_first=by_first[:, :, axis],
         upright_second=by_second[:, :, axis],
-        chain=chain[link],
-        place=place[link] + share,
+        chain=track[0][link],
+        place=track[1][link] + share,
     )
 
 

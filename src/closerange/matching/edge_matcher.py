@@ -4,22 +4,22 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from closerange.features.edge_chains import chain_window
-from closerange.features.edge_uncertainty import chain_mean
 from closerange.features.edges import EdgePoints
 from closerange.flags import Flag
 from closerange.geometry.arrays import BoolArray, FloatArray, IntArray
-from closerange.matching.candidates import SHALLOWEST, Candidates, find_candidates, sweep_axis
-from closerange.matching.chain_fit import fit_chains
-from closerange.matching.continuity import Choice, choose
+from closerange.matching.candidates import Candidates, find_candidates, sweep_axis
+from closerange.matching.continuity import NO_MATCH, Choice, choose
 from closerange.matching.depth_table import MISFIT_LIMIT_PX
-from closerange.matching.evidence import unary_cost
+from closerange.matching.edge_covariance import SmoothedMatches, smooth_matches
+from closerange.matching.element_weights import best_rows
+from closerange.matching.evidence import OTHER_PX, unary_cost
 from closerange.matching.pencil import Pencil
 from closerange.rig.camera import Camera
 
@@ -39,18 +39,35 @@ that of equal stripes one wins clearly."""
 TIE_REACH = 10
 """Points of the chain on each side over which that lead is averaged."""
 
+USUAL = 0.25
+"""Quantile of the costs of matches that agree both ways that is taken for what a right one costs.
+Of noise and hidden edges some agree by chance, and cost more: the lowest quarter is of others."""
+
+MORE_PX = 1.6
+"""What a match may cost more than that before no match is preferred: on plain and on cluttered
+scenes one right match in twenty does."""
+
+UNRELATED_PX = 1.65
+"""Such a cost above which the images may not be of one scene, and nothing is learnt from it: on
+plain scenes it is 0.7 to 1.3, on cluttered ones 1.5, of images that do not belong together 1.8 and
+more."""
+
+FEWEST_MUTUAL = 40
+"""Such matches without which their median says nothing."""
+
 STRAY = 3.0
 """Residual against the smoothed chain, in standard deviations, that is not chance."""
 
-UNSURE_PX = 0.5
-"""Standard deviation along the epipolar curve above which a match is flagged: two of them are
-about a pixel, and a match is expected to be right to that."""
-
-WIDER = 1.15
-"""Ratio of second moments that noise and the angle of view explain."""
+UNSURE_PX = 0.45
+"""Standard deviation along the epipolar curve above which a match is flagged: a match is expected
+to be right to a pixel, which 97 of 100 of the least certain ones then are (2.2 deviations)."""
 
 SHALLOW_SINE = 0.3
 """Sine between edge and epipolar curve below which uncertainty is blamed on it: 17 degrees."""
+
+ONE_BY_ONE = 250_000
+"""Edge points from which on one direction of matching waits for the other: both at once would
+take more than 1.5 GB, at 5 to 10 candidates of a point and 0.3 kB of each."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -117,126 +134,78 @@ def match_edges(
     EdgeMatches
         One row for each edge point of the first view.
     """
-    with ThreadPoolExecutor(2) as pool:
-        there = pool.submit(_matched, pencil, edges, greys, volume_mm, others)
-        back = pool.submit(_matched, pencil.reversed(), edges[::-1], greys[::-1], volume_mm, others)
-        forward, backward = there.result(), back.result()
-    smooth = _smoothed(pencil, edges, forward, sweep_axis(pencil))
+    axis = sweep_axis(pencil)
+    ways = ((pencil, edges, greys), (pencil.reversed(), edges[::-1], greys[::-1]))
+    most = max(len(edge) for edge in edges)
+    with ThreadPoolExecutor(1 if most > ONE_BY_ONE else 2) as pool:
+        found = list(pool.map(lambda way: _evidence(way, volume_mm, others), ways))
+        no_match = _cost_of_none(edges[1], found, axis, len(others))
+        forward, backward = pool.map(
+            lambda way, evidence: _chosen(way[1][0], evidence, axis, no_match), ways, found
+        )
+    smooth = smooth_matches(pencil, edges, forward.candidates, forward.choice, axis)
     return _judged(pencil, edges, (forward, backward), smooth, volume_mm)
 
 
-def _matched(
-    pencil: Pencil,
-    edges: tuple[EdgePoints, EdgePoints],
-    greys: tuple[NDArray[Any], NDArray[Any]],
+@dataclass(frozen=True, slots=True, eq=False)
+class _Evidence:
+    """Candidates of one direction and what each costs."""
+
+    candidates: Candidates
+    cost: FloatArray
+
+
+def _evidence(
+    way: tuple[Pencil, tuple[EdgePoints, EdgePoints], tuple[NDArray[Any], NDArray[Any]]],
     volume_mm: FloatArray,
     others: Sequence[tuple[Camera, EdgePoints]],
-) -> _Side:
-    axis = sweep_axis(pencil)
+) -> _Evidence:
+    pencil, edges, greys = way
     candidates = find_candidates(pencil, *edges, volume_mm)
-    cost = unary_cost(edges[0], candidates, greys, pencil, others)
-    choice = choose(edges[0], candidates, cost, axis)
-    height = np.full(len(edges[0]), np.nan)
+    return _Evidence(candidates, unary_cost(edges[0], candidates, greys, pencil, others))
+
+
+def _cost_of_none(second: EdgePoints, found: Sequence[_Evidence], axis: int, others: int) -> float:
+    """Return what having no match shall cost: more than what a right one costs in these images.
+
+    On slanted and cluttered parts right matches cost more than on level ones. Which are right is
+    not known; that the cheapest of either direction are each other's is a good sign of it.
+    """
+    there, back = found
+    if not len(there.candidates) or not len(back.candidates):
+        return NO_MATCH
+    best = best_rows(there.cost, there.candidates.point)
+    cheapest = best_rows(back.cost, back.candidates.point)
+    height = np.full(len(second), np.nan)
+    height[back.candidates.point[cheapest]] = back.candidates.xyz_mm[cheapest, axis]
+    mutual = _returning(there.candidates.select(best), height, second, axis)
+    if mutual.sum() < FEWEST_MUTUAL:
+        return NO_MATCH
+    usual = float(np.quantile(there.cost[best[mutual]], USUAL))
+    if usual > UNRELATED_PX:
+        return NO_MATCH
+    # a right match may be hidden from all further views, which most are not
+    return min(usual + MORE_PX, MISFIT_LIMIT_PX) + others * OTHER_PX
+
+
+def _chosen(first: EdgePoints, evidence: _Evidence, axis: int, no_match: float) -> _Side:
+    candidates = evidence.candidates
+    choice = choose(first, candidates, evidence.cost, axis, no_match)
+    height = np.full(len(first), np.nan)
     height[choice.matched] = candidates.xyz_mm[choice.candidate[choice.matched], axis]
-    return _Side(candidates, choice, height)
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class _Smoothed:
-    """Heights after smoothing along chains; N points."""
-
-    height_mm: FloatArray
-    std_px: FloatArray
-    rate: FloatArray
-    residual: FloatArray
-    sine: FloatArray
-
-
-def _smoothed(
-    pencil: Pencil, edges: tuple[EdgePoints, EdgePoints], side: _Side, axis: int
-) -> _Smoothed:
-    count = len(edges[0])
-    rows = np.flatnonzero(side.choice.candidate >= 0)
-    if not rows.size:
-        return _Smoothed(*(np.full(count, np.nan) for _ in range(5)))
-    chosen = side.candidates.select(side.choice.candidate[rows])
-    px_per_mm = float(np.median(chosen.px_per_mm))
-    to_px = px_per_mm / chosen.px_per_mm
-    pace, sine_first = _in_first_view(pencil, edges[0].tangent[rows], chosen, axis)
-    along_first = pace / sine_first
-    merged = _merged(edges, rows, chosen)
-    noise = np.hypot(
-        edges[0].noise_px[rows] * along_first,
-        _between(edges[1].noise_px, chosen, edges[1]) / chosen.sine,
-    )
-    model = np.hypot(
-        np.hypot(edges[0].model_px[rows], merged[0]) * along_first,
-        np.hypot(_between(edges[1].model_px, chosen, edges[1]), merged[1]) / chosen.sine,
-    )
-    std, value, sine = (np.full(count, np.nan) for _ in range(3))
-    # a point without a candidate stands between its neighbours, with the usual share of theirs
-    common, rate = (np.full(count, np.median(usual)) for usual in (model * to_px, pace))
-    std[rows], common[rows] = np.hypot(noise, model) * to_px, model * to_px
-    value[rows], sine[rows] = chosen.xyz_mm[:, axis] * px_per_mm, chosen.sine
-    rate[rows] = pace
-    fit = fit_chains(edges[0], np.where(side.choice.matched, value, np.nan), std)
-    # smoothing removes noise; what the edge is not, its neighbours share
-    return _Smoothed(
-        fit.value_px / px_per_mm, np.hypot(fit.std_px, common), rate, fit.residual, sine
-    )
-
-
-def _merged(
-    edges: tuple[EdgePoints, EdgePoints], rows: IntArray, chosen: Candidates
-) -> tuple[FloatArray, FloatArray]:
-    """Return how far edges may be off that are wider in one view than in the other, px.
-
-    A face that is seen at a low angle is so thin in one view that its two edges look like one,
-    wider than it should be. Two steps of weights p and 1 - p at a distance d enlarge the second
-    moment by p (1 - p) d^2, which is also the mean square distance of the steps from the middle.
-    """
-    width = [chain_mean(edge.width_px2, edge.after) for edge in edges]
-    here = width[0][rows]
-    there = _between(np.sqrt(width[1]), chosen, edges[1]) ** 2
-    usual = [
-        np.quantile(wide[edge.strength >= np.median(edge.strength)], 0.3)
-        for wide, edge in zip(width, edges, strict=True)
-    ]
-    sharp = np.minimum(here, there)
-    return (
-        np.sqrt(np.maximum(here - WIDER * np.maximum(sharp, usual[0]), 0.0)),
-        np.sqrt(np.maximum(there - WIDER * np.maximum(sharp, usual[1]), 0.0)),
-    )
-
-
-def _between(value: FloatArray, chosen: Candidates, second: EdgePoints) -> FloatArray:
-    """Interpolate a property of the second view's edge points to the crossings."""
-    after = second.after[chosen.link]
-    return np.asarray(
-        np.sqrt((1 - chosen.share) * value[chosen.link] ** 2 + chosen.share * value[after] ** 2)
-    )
-
-
-def _in_first_view(
-    pencil: Pencil, tangent: FloatArray, chosen: Candidates, axis: int
-) -> tuple[FloatArray, FloatArray]:
-    """Return px in the second view per px in the first, along the epipolar curves of both.
-
-    And the sine of the angle between edge and curve in the first view.
-    """
-    ray = chosen.xyz_mm - pencil.second.centre_mm
-    jacobian = pencil.first.project_jacobian(chosen.xyz_mm)
-    moved = np.einsum("nij,nj->ni", jacobian, ray / ray[:, axis, None])
-    length = np.linalg.norm(moved, axis=1)
-    across = np.abs(moved[:, 0] * tangent[:, 1] - moved[:, 1] * tangent[:, 0])
-    return chosen.px_per_mm / length, np.maximum(across / length, SHALLOWEST)
+    # the others, most of them, are done with and would only take up memory
+    rows = np.flatnonzero(choice.candidate >= 0)
+    kept = candidates.select(choice.candidate[rows])
+    candidate = np.full(len(height), -1, dtype=np.int64)
+    candidate[rows] = np.arange(len(rows))
+    return _Side(kept, replace(choice, candidate=candidate), height)
 
 
 def _judged(
     pencil: Pencil,
     edges: tuple[EdgePoints, EdgePoints],
     sides: tuple[_Side, _Side],
-    smooth: _Smoothed,
+    smooth: SmoothedMatches,
     volume_mm: FloatArray,
 ) -> EdgeMatches:
     axis = sweep_axis(pencil)
@@ -290,17 +259,26 @@ def on_rays(pencil: Pencil, xy_px: FloatArray, height_mm: FloatArray, axis: int)
 
 
 def _returns(
-    sides: tuple[_Side, _Side], second: EdgePoints, smooth: _Smoothed, axis: int
+    sides: tuple[_Side, _Side], second: EdgePoints, smooth: SmoothedMatches, axis: int
 ) -> BoolArray:
     """Mark the points whose match, matched back, has the same height."""
     forward, backward = sides
     rows = np.flatnonzero(forward.choice.candidate >= 0)
     chosen = forward.candidates.select(forward.choice.candidate[rows])
     returns = np.zeros(len(smooth.height_mm), dtype=bool)
+    returns[rows] = _returning(chosen, backward.height_mm, second, axis)
+    return returns
+
+
+def _returning(
+    chosen: Candidates, height_mm: FloatArray, second: EdgePoints, axis: int
+) -> BoolArray:
+    """Mark the candidates at which the second view's edge points have the same height."""
+    returns = np.zeros(len(chosen), dtype=bool)
     for end in (chosen.link, second.after[chosen.link]):
-        apart = np.abs(backward.height_mm[end] - chosen.xyz_mm[:, axis]) * chosen.px_per_mm
+        apart = np.abs(height_mm[end] - chosen.xyz_mm[:, axis]) * chosen.px_per_mm
         with np.errstate(invalid="ignore"):
-            returns[rows] |= apart < RETURN_PX
+            returns |= apart < RETURN_PX
     return returns
 
 

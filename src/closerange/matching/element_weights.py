@@ -2,30 +2,36 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-
 import numpy as np
 
-from closerange.features.edge_chains import chain_places
 from closerange.features.edges import EdgePoints
 from closerange.geometry.arrays import FloatArray, IntArray
 from closerange.matching.candidates import Candidates
-from closerange.matching.depth_table import MISFIT_LIMIT_PX, DepthTable
+from closerange.matching.depth_table import MISFIT_LIMIT_PX, DepthTable, Element, Square, Strip
+from closerange.matching.slanted_edges import slanted_misfit
 
-SQUARES = (0.045, 0.094)
-"""Half-widths of the square elements per image width. A twentieth of a picture of whole parts
-holds the neighbouring edges of a part, a tenth most of the part: what repeats within it is told
-apart by what does not. Smaller squares lose on every scene (`benchmarks/bench_structuring.py`)."""
+SQUARES = (0.02, 0.045, 0.094)
+"""Half-widths of the square elements per image width, in steps of about two. Of a picture of whole
+parts a fiftieth holds one corner or rim, a twentieth the neighbouring edges of a part, a tenth most
+of the part: what repeats within it is told apart by what does not. Which steps they are hardly
+matters: see `benchmarks/bench_elements.py`."""
 
-STRIP = 0.0625
-"""Half-length of the element that follows the point's own chain, per image width. It holds no edge
-of another height: right for wires and thin parts, where a square sees mostly what does not fit."""
+STRIPS = (0.0625, 0.25)
+"""Half-lengths of the elements that follow the point's own chain, per image width: some of it, and
+mostly all. They hold no edge of another part: right for wires and thin parts, where a square sees
+mostly what does not fit. The short one stays on one side of a corner."""
 
-COLUMNS = 64
-"""Heights that are worked on at once: 100 MB for 200 000 edge points."""
+SLANT_PRICE = MISFIT_LIMIT_PX / 2
+"""Cost in px of the less usual hypothesis that an edge is slanted: it is preferred to a level
+element of which half the points find nothing, or all fit half as well as can be told."""
 
 ELSEWHERE_PX = 1.5
 """Candidates further apart than this, along the epipolar curve, are different answers."""
+
+POWER = 2
+"""Power of the margins that are the weights: of measurements whose signals differ and whose noise
+is alike, a mean weighted by the squared signals is the surest. Noise is nearly alike: most of it is
+what an element sees of other heights, which more edges do not average out."""
 
 
 def support(first: EdgePoints, candidates: Candidates, table: DepthTable) -> FloatArray:
@@ -33,7 +39,13 @@ def support(first: EdgePoints, candidates: Candidates, table: DepthTable) -> Flo
 
     For every point each element has an answer, its best candidate, and a margin: by how much the
     best candidate elsewhere is worse. An element that is too small, or sees only what repeats,
-    or sees other heights, has a small margin. Elements are weighted by the square of it.
+    or sees other heights, has a small margin. Elements are weighted by the square of it. A point
+    with one candidate has no margins, and the question is whether it is there at all: the smallest
+    square, which holds little but the point's own edge, and the whole chain, much of which is
+    elsewhere, have no say in that.
+
+    All elements are level, as the thesis' is. Where they fit badly the edge may be slanted: how far
+    it runs beside the candidate's chain is the cost then.
 
     Parameters
     ----------
@@ -44,64 +56,45 @@ def support(first: EdgePoints, candidates: Candidates, table: DepthTable) -> Flo
     table : DepthTable
         Misfit of every edge point at every height.
     """
-    costs = element_costs(first, candidates, table)
-    weights = np.array([_margin(cost, candidates, table.axis) ** 2 for cost in costs])
-    weights += 1e-6  # points with one candidate: all the same
-    weights /= weights.sum(axis=0)
-    return np.asarray(np.einsum("em,em->m", np.array(costs), weights))
+    costs = np.array(table.means(candidates, _elements(first, table)))
+    margins = np.array([_margin(cost, candidates, table.axis) for cost in costs])
+    weights = margins**POWER + 1e-6  # none has a margin: all the same
+    level = np.einsum("em,em->m", costs, weights / weights.sum(axis=0))
+    alone = (margins == MISFIT_LIMIT_PX).all(axis=0)
+    level[alone] = costs[1:-1, alone].mean(axis=0)
+    reach = round(max(STRIPS) * first.size_px[0])
+    slanted = slanted_misfit(first, candidates, table.line, table.axis, reach)
+    return np.asarray(np.minimum(level, slanted + SLANT_PRICE))
 
 
-def element_costs(
-    first: EdgePoints, candidates: Candidates, table: DepthTable
-) -> Sequence[FloatArray]:
-    """Return the mean misfit within each element: two squares and the strip, shape (M,) each."""
+def _elements(first: EdgePoints, table: DepthTable) -> list[Element]:
+    """Return squares and strips, the smallest square first and the longest strip last."""
     width = first.size_px[0]
-    squares = [table.support(first.xy_px, candidates, share * width) for share in SQUARES]
-    return [*squares, chain_misfit(first, candidates, table, round(STRIP * width))]
-
-
-def chain_misfit(
-    first: EdgePoints, candidates: Candidates, table: DepthTable, reach: int
-) -> FloatArray:
-    """Return the mean misfit of the point's chain, so many points to each side, shape (M,).
-
-    By running sums along the chains, some columns of the table at a time: neither time nor memory
-    grows with the length of the element. A closed chain counts as cut at its first point.
-    """
-    chain, place = chain_places(first.after)
-    order = np.lexsort((place, chain))
-    rank = np.empty_like(order)
-    rank[order] = np.arange(len(order))
-    left = np.minimum(place, reach)
-    right = np.minimum(np.bincount(chain)[chain] - 1 - place, reach)
-    low = (rank - left)[candidates.point]
-    high = (rank + right)[candidates.point] + 1
-    column = table.column(candidates.xyz_mm[:, table.axis])
-    mean = np.full(len(candidates), MISFIT_LIMIT_PX)
-    summed = np.zeros((len(order) + 1, COLUMNS))
-    for start in range(0, table.misfit.shape[1], COLUMNS):
-        part = table.misfit[order, start : start + COLUMNS]
-        np.cumsum(part, axis=0, dtype=np.float64, out=summed[1:, : part.shape[1]])
-        rows = np.flatnonzero((column >= start) & (column < start + COLUMNS))
-        here = column[rows] - start
-        total = summed[high[rows], here] - summed[low[rows], here]
-        mean[rows] = total / (high - low)[rows]
-    return mean
+    squares = [Square.of(table.line, first.xy_px, share * width) for share in SQUARES]
+    strips = [Strip.of(table.line, round(share * width)) for share in STRIPS]
+    return [*squares, *strips]
 
 
 def _margin(cost: FloatArray, candidates: Candidates, axis: int) -> FloatArray:
     """Return, for each candidate's point, how much worse the best answer elsewhere is."""
-    point = candidates.point
-    best = best_rows(cost, point)
-    place = np.cumsum(np.r_[True, np.diff(point) > 0]) - 1  # points are in ascending order
+    start, place = _groups(candidates.point)
+    best = best_rows(cost, candidates.point)
     apart = candidates.xyz_mm[:, axis] - candidates.xyz_mm[best, axis][place]
     elsewhere = np.abs(apart) * candidates.px_per_mm > ELSEWHERE_PX
-    margin = np.full(len(best), MISFIT_LIMIT_PX)
-    np.minimum.at(margin, place[elsewhere], (cost - cost[best][place])[elsewhere])
-    return np.asarray(margin[place])
+    worse = np.where(elsewhere, cost - cost[best][place], MISFIT_LIMIT_PX)
+    return np.asarray(np.minimum(np.minimum.reduceat(worse, start), MISFIT_LIMIT_PX)[place])
 
 
 def best_rows(cost: FloatArray, point: IntArray) -> IntArray:
     """Return the row of the least cost of each point that has a row, points ascending."""
-    order = np.lexsort((cost, point))
-    return order[np.r_[True, np.diff(point[order]) > 0]]
+    start, place = _groups(point)
+    known = np.where(np.isnan(cost), np.inf, cost)
+    least = np.flatnonzero(known == np.minimum.reduceat(known, start)[place])
+    # of equal ones the first
+    return least[np.r_[True, np.diff(place[least]) > 0]]
+
+
+def _groups(point: IntArray) -> tuple[IntArray, IntArray]:
+    """Return the first row of each point, and the number of its point for each row."""
+    begins = np.r_[True, point[1:] != point[:-1]]
+    return np.flatnonzero(begins), np.cumsum(begins) - 1

@@ -15,7 +15,7 @@ from closerange.features.edges import EdgePoints
 from closerange.geometry.arrays import BoolArray, FloatArray
 from closerange.geometry.interpolation import bilinear
 from closerange.matching.candidates import Candidates, sweep_axis
-from closerange.matching.depth_table import MISFIT_LIMIT_PX, DepthTable
+from closerange.matching.depth_table import MISFIT_LIMIT_PX, DepthTable, Line
 from closerange.matching.element_weights import best_rows, support
 from closerange.matching.pencil import Pencil
 from closerange.rig.camera import Camera
@@ -59,18 +59,29 @@ OTHER_WEIGHT = 0.5
 HIDDEN_PX = 2.0
 """Misfit in a further view where nothing is near."""
 
+OTHER_PX = OTHER_WEIGHT * HIDDEN_PX
+"""Most that a further view takes off the cost of a candidate."""
+
 GOOD_PX = 1.0
 """Cost of candidates from which the brightness of the two views is compared: misfit of a pixel."""
 
 LEAST_PAIRS = 40
 """Pairs of grey values without which both cameras are taken to see the same brightness."""
 
+PLACES_AT_ONCE = 50_000
+"""Places at which grey values are read at once: 0.4 MB for each number."""
+
+ENOUGH_PIXELS = 250_000
+"""Pixels from which the range of an image is taken: its thousandth part then is 250 of them."""
+
 
 def turn(first: EdgePoints, candidates: Candidates) -> FloatArray:
     """Return the angle between the found direction and that of a level edge, rad, shape (M,)."""
     expected = np.einsum("nij,nj->ni", candidates.level, first.tangent[candidates.point])
-    cosine = _cosine(expected, candidates.tangent)
-    return np.asarray(np.arccos(np.clip(np.nan_to_num(cosine, nan=-1.0), -1.0, 1.0)))
+    (x, y), (along_x, along_y) = expected.T, candidates.tangent.T
+    # by both products: the cosine alone does not tell small angles
+    angle = np.arctan2(np.abs(x * along_y - y * along_x), x * along_x + y * along_y)
+    return np.asarray(np.nan_to_num(angle, nan=np.pi))
 
 
 def unary_cost(
@@ -107,20 +118,28 @@ def unary_cost(
     """
     if not len(candidates):
         return np.zeros(0)
-    axis = sweep_axis(pencil)
-    origin_mm = float(pencil.first.centre_mm[axis])
-    turned = np.clip(turn(first, candidates) / TURN_RAD, 0.0, MISFIT_LIMIT_PX)
-    table = DepthTable.of(len(first), candidates, turned, axis, origin_mm)
-    cost = support(first, candidates, table) + TURN_WEIGHT * turned
-    upright, slope = _upright(first, candidates)
-    if upright.any():
-        rows = candidates.select(upright)
-        chain = _chain_misfit(first, rows, slope[upright], (axis, origin_mm))
-        cost[upright] = np.minimum(cost[upright], chain + UPRIGHT_PRICE)
+    cost = _misfit(first, candidates, pencil)
     for camera, edges in others:
         # a reward, not a price: what a further view does not show may be hidden there
         cost += OTHER_WEIGHT * (_other_view(camera, edges, candidates) - HIDDEN_PX)
     return np.asarray(cost + side_cost(first, candidates, greys, cost))
+
+
+def _misfit(first: EdgePoints, candidates: Candidates, pencil: Pencil) -> FloatArray:
+    """Return the cost without grey values and without further views, shape (M,)."""
+    axis = sweep_axis(pencil)
+    origin_mm = float(pencil.first.centre_mm[axis])
+    line = Line.of(first.after)
+    turned = np.clip(turn(first, candidates) / TURN_RAD, 0.0, MISFIT_LIMIT_PX)
+    table = DepthTable.of(line, candidates, turned, axis, origin_mm)
+    cost = support(first, candidates, table) + TURN_WEIGHT * turned
+    upright, slope = _upright(first, candidates)
+    if upright.any():
+        rows = candidates.select(upright)
+        climbing = DepthTable.of(line, rows, np.zeros(len(rows)), axis, origin_mm)
+        chain = _chain_misfit(first, rows, slope[upright], climbing)
+        cost[upright] = np.minimum(cost[upright], chain + UPRIGHT_PRICE)
+    return np.asarray(cost)
 
 
 def _other_view(camera: Camera, edges: EdgePoints, candidates: Candidates) -> FloatArray:
@@ -154,11 +173,17 @@ def side_cost(
     best = best_rows(cost, candidates.point)
     best = best[cost[best] < GOOD_PX]
     gain, offset = _brightness(beside_1[best].ravel(), beside_2[best].ravel())
-    scale = np.ptp(np.quantile(greys[1], [0.001, 0.999]))
+    scale = np.ptp(np.quantile(_thinned(greys[1]), [0.001, 0.999]))
     contrast = np.maximum(gain * np.abs(beside_1[:, 1] - beside_1[:, 0]), LEAST_CONTRAST * scale)
     difference = np.sort(np.abs(gain * beside_1 + offset - beside_2), axis=1)
     misfit = np.minimum(difference / (contrast * SIDE_TOLERANCE)[:, None], SIDE_LIMIT)
     return np.asarray(misfit @ [1.0, FAR_WEIGHT])
+
+
+def _thinned(grey: NDArray[Any]) -> NDArray[Any]:
+    """Return every n-th pixel of every n-th row of a large image."""
+    step = max(int(np.sqrt(grey.size / ENOUGH_PIXELS)), 1)
+    return grey[::step, ::step]
 
 
 def _brightness(grey_1: FloatArray, grey_2: FloatArray) -> tuple[float, float]:
@@ -184,9 +209,12 @@ def _brightness(grey_1: FloatArray, grey_2: FloatArray) -> tuple[float, float]:
 def _sides(grey: NDArray[Any], xy_px: FloatArray, normal: FloatArray) -> FloatArray:
     """Read the grey on the dark and on the bright side, shape (N, 2)."""
     smooth = cv2.GaussianBlur(grey, (0, 0), 0.7)
-    return np.column_stack(
-        [bilinear(smooth, xy_px + sign * SIDE_STEP_PX * normal) for sign in (-1, 1)]
-    )
+    beside = np.empty((len(xy_px), 2))
+    for start in range(0, len(xy_px), PLACES_AT_ONCE):
+        rows = slice(start, start + PLACES_AT_ONCE)
+        for side, sign in enumerate((-1, 1)):
+            beside[rows, side] = bilinear(smooth, xy_px[rows] + sign * SIDE_STEP_PX * normal[rows])
+    return beside
 
 
 def _upright(first: EdgePoints, candidates: Candidates) -> tuple[BoolArray, FloatArray]:
@@ -201,15 +229,14 @@ def _upright(first: EdgePoints, candidates: Candidates) -> tuple[BoolArray, Floa
 
 
 def _chain_misfit(
-    first: EdgePoints, upright: Candidates, slope: FloatArray, along: tuple[int, float]
+    first: EdgePoints, upright: Candidates, slope: FloatArray, table: DepthTable
 ) -> FloatArray:
     """Return the mean misfit of a chain that climbs along the sweep axis, shape (M,)."""
-    table = DepthTable.of(len(first), upright, np.zeros(len(upright)), *along)
     window = chain_window(first.after, first.before, UPRIGHT_REACH)[upright.point]
     there = window >= 0
     step = first.xy_px[window] - first.xy_px[upright.point][:, None]
     way = np.einsum("nki,ni->nk", step, first.tangent[upright.point])
-    height = upright.xyz_mm[:, along[0], None] + slope[:, None] * way
+    height = upright.xyz_mm[:, table.axis, None] + slope[:, None] * way
     misfit = np.where(there, table.at(window, height), 0.0)
     return np.asarray(misfit.sum(axis=1) / there.sum(axis=1))
 

@@ -10,6 +10,10 @@ from closerange.errors import InputError
 from closerange.geometry.arrays import FloatArray
 from closerange.rig.camera import Camera
 
+AT_ONCE = 16_000
+"""Rays that are worked on at once. Of more, the products with small matrices are shared out
+between processors, which takes longer than the products where others work too."""
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Pencil:
@@ -72,8 +76,13 @@ class Pencil:
 
     def coordinates(self, camera: Camera, xy_px: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Return theta (rad) and slope of the rays of pixels, shape (N,) each."""
-        ray = camera.directions(xy_px) @ self.axes.T
-        return np.arctan2(ray[:, 2], ray[:, 1]), ray[:, 0] / np.hypot(ray[:, 1], ray[:, 2])
+        theta, slope = np.empty(len(xy_px)), np.empty(len(xy_px))
+        for start in range(0, len(xy_px), AT_ONCE):
+            some = slice(start, start + AT_ONCE)
+            along, across, upwards = (camera.directions(xy_px[some]) @ self.axes.T).T
+            theta[some] = np.arctan2(upwards, across)
+            slope[some] = along / np.hypot(across, upwards)
+        return theta, slope
 
     def point(self, theta: FloatArray, first: FloatArray, second: FloatArray) -> FloatArray:
         """Return where rays of one theta meet, shape (N, 3), world mm.
