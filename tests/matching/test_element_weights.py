@@ -111,7 +111,7 @@ def test_the_weights_are_the_squared_margins(monkeypatch):
         np.testing.assert_allclose(found[rows], wanted, atol=1e-9)
 
 
-def test_one_candidate_costs_the_mean_of_the_middle_elements(monkeypatch):
+def test_with_one_candidate_squares_have_twice_the_say_of_strips(monkeypatch):
     pencil = _pencil()
     monkeypatch.setattr(element_weights, "SLANT_PRICE", np.inf)
     edges, candidates, table = _matched(
@@ -126,9 +126,11 @@ def test_one_candidate_costs_the_mean_of_the_middle_elements(monkeypatch):
         table.origin_mm,
     )
     found = support(edges, candidates, table)
-    elements = [Square.of(table.line, edges.xy_px, share * SIZE[0]) for share in SQUARES[1:]]
-    elements += [Strip.of(table.line, round(share * SIZE[0])) for share in STRIPS[:-1]]
-    np.testing.assert_allclose(found, np.mean(table.means(candidates, elements), axis=0))
+    squares = [Square.of(table.line, edges.xy_px, share * SIZE[0]) for share in SQUARES]
+    strips = [Strip.of(table.line, round(share * SIZE[0])) for share in STRIPS]
+    wanted = 2 * np.mean(table.means(candidates, squares), axis=0)
+    wanted += np.mean(table.means(candidates, strips), axis=0)
+    np.testing.assert_allclose(found, wanted / 3)
     assert np.ptp(found) > 0.1
 
 

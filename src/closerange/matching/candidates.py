@@ -171,9 +171,9 @@ def _crossings(
     """Return point, piece of chain, share of it and slope of the crossings in the volume."""
     first, second = edges
     theta, slope = rays
-    lowest, highest = _slopes_within(pencil, theta, slope, volume_mm)
+    lowest, highest = slopes_within(pencil, theta, slope, volume_mm)
     theta_2, slope_2 = pencil.coordinates(pencil.second, second.xy_px)
-    rise = np.sign(np.where(lowest <= highest, _rise(theta, first), 0.0))
+    rise = np.sign(np.where(lowest <= highest, rise_along(theta, first), 0.0))
     link = np.flatnonzero(second.after >= 0)
     climb = theta_2[second.after[link]] - theta_2[link]
     found = [(np.zeros(0, np.int64), np.zeros(0, np.int64), np.zeros(0), np.zeros(0))]
@@ -184,7 +184,7 @@ def _crossings(
         after = second.after[pieces]
         start, step = theta_2[pieces], theta_2[after] - theta_2[pieces]
         ends = (start, theta_2[after])[::sign]
-        for nearby, crossed in _straddled(theta[points], *ends):
+        for nearby, crossed in straddled(theta[points], *ends):
             point, piece = points[nearby], pieces[crossed]
             share = (theta[point] - start[crossed]) / step[crossed]
             met = slope_2[piece] + share * (slope_2[after[crossed]] - slope_2[piece])
@@ -195,7 +195,7 @@ def _crossings(
     return point[order], piece[order], share[order], met[order]
 
 
-def _slopes_within(
+def slopes_within(
     pencil: Pencil, theta: FloatArray, slope: FloatArray, volume_mm: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
     """Return the least and largest slope of rays of the second camera that meet in the volume.
@@ -215,7 +215,7 @@ def _slopes_within(
         return lowest, slope - pencil.baseline_mm * (1 - SLACK) / furthest
 
 
-def _straddled(
+def straddled(
     ordered: FloatArray, low: FloatArray, high: FloatArray
 ) -> Iterator[tuple[IntArray, IntArray]]:
     """Yield all pairs (i, j) with low[j] <= ordered[i] < high[j], some at a time."""
@@ -229,7 +229,7 @@ def _straddled(
         yield start[piece] + offset, piece
 
 
-def _rise(theta: FloatArray, edges: EdgePoints) -> FloatArray:
+def rise_along(theta: FloatArray, edges: EdgePoints) -> FloatArray:
     """Return the change of theta along the chain through each point."""
     ahead = np.where(edges.after >= 0, theta[edges.after] - theta, 0.0)
     behind = np.where(edges.before >= 0, theta - theta[edges.before], 0.0)

@@ -21,6 +21,7 @@ from closerange.matching.edge_covariance import SmoothedMatches, smooth_matches
 from closerange.matching.element_weights import best_rows
 from closerange.matching.evidence import OTHER_PX, unary_cost
 from closerange.matching.pencil import Pencil
+from closerange.matching.repeats import hidden_repeats
 from closerange.rig.camera import Camera
 
 RETURN_PX = 1.5
@@ -144,7 +145,10 @@ def match_edges(
             lambda way, evidence: _chosen(way[1][0], evidence, axis, no_match), ways, found
         )
     smooth = smooth_matches(pencil, edges, forward.candidates, forward.choice, axis)
-    return _judged(pencil, edges, (forward, backward), smooth, volume_mm)
+    matches = _judged(pencil, edges, (forward, backward), smooth, volume_mm)
+    unsure = _repeated(pencil, edges, greys, (forward, backward), matches.flags == 0, volume_mm)
+    matches.flags[unsure] |= int(Flag.ambiguous)
+    return matches
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -222,7 +226,7 @@ def _judged(
             (Flag.occluded, (choice.candidate >= 0) & ~choice.matched),
             (Flag.inconsistent, choice.matched & ~_returns(sides, edges[1], smooth, axis)),
             (Flag.ambiguous, choice.matched & (choice.margin < MARGIN_PX)),
-            (Flag.ambiguous, choice.matched & _tied(edges[0], choice)),
+            (Flag.ambiguous, choice.matched & _tied(edges[0], choice, TIE_PX)),
             (Flag.residual, np.abs(smooth.residual) > STRAY),
             (Flag.aperture, unsure & (smooth.sine < SHALLOW_SINE)),
             (Flag.poor_fit, unsure & (smooth.sine >= SHALLOW_SINE)),
@@ -239,14 +243,33 @@ def _judged(
     )
 
 
-def _tied(first: EdgePoints, choice: Choice) -> BoolArray:
+def _tied(first: EdgePoints, choice: Choice, least_px: float) -> BoolArray:
     """Mark the points around which another place fits the images about as well."""
     window = chain_window(first.after, first.before, TIE_REACH)
     # more than the limit of misfit says no more
     lead = np.clip(choice.lead, -MISFIT_LIMIT_PX, MISFIT_LIMIT_PX)
     there = (window >= 0) & choice.matched[window]
     total = np.where(there, lead[window], 0.0).sum(axis=1)
-    return np.asarray(total < TIE_PX * there.sum(axis=1))
+    return np.asarray(total < least_px * there.sum(axis=1))
+
+
+def _repeated(
+    pencil: Pencil,
+    edges: tuple[EdgePoints, EdgePoints],
+    greys: tuple[NDArray[Any], NDArray[Any]],
+    sides: tuple[_Side, _Side],
+    relied: BoolArray,
+    volume_mm: FloatArray,
+) -> BoolArray:
+    """Mark matches that fit as well with another repeat, whose place neither view shows."""
+    forward, backward = sides
+    matched = np.flatnonzero(forward.choice.matched[forward.candidates.point])
+    clear = (
+        ~_tied(edges[0], forward.choice, MARGIN_PX),
+        ~_tied(edges[1], backward.choice, MARGIN_PX),
+    )
+    chosen = forward.candidates.select(matched)
+    return hidden_repeats(pencil, edges, greys, chosen, relied, clear, volume_mm)
 
 
 def on_rays(pencil: Pencil, xy_px: FloatArray, height_mm: FloatArray, axis: int) -> FloatArray:

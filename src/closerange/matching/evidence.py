@@ -166,10 +166,10 @@ def side_cost(
     fitted beforehand to the candidates that are the best of their point and good by the other
     evidence alone.
     """
-    beside_1 = _sides(greys[0], first.xy_px, first.normal)[candidates.point]
+    beside_1 = grey_beside(greys[0], first.xy_px, first.normal)[candidates.point]
     # across the crossed chain, towards its brighter side
     normal = np.column_stack([candidates.tangent[:, 1], -candidates.tangent[:, 0]])
-    beside_2 = _sides(greys[1], candidates.xy_px, normal)
+    beside_2 = grey_beside(greys[1], candidates.xy_px, normal)
     best = best_rows(cost, candidates.point)
     best = best[cost[best] < GOOD_PX]
     gain, offset = _brightness(beside_1[best].ravel(), beside_2[best].ravel())
@@ -206,7 +206,7 @@ def _brightness(grey_1: FloatArray, grey_2: FloatArray) -> tuple[float, float]:
     return gain, offset
 
 
-def _sides(grey: NDArray[Any], xy_px: FloatArray, normal: FloatArray) -> FloatArray:
+def grey_beside(grey: NDArray[Any], xy_px: FloatArray, normal: FloatArray) -> FloatArray:
     """Read the grey on the dark and on the bright side, shape (N, 2)."""
     smooth = cv2.GaussianBlur(grey, (0, 0), 0.7)
     beside = np.empty((len(xy_px), 2))
