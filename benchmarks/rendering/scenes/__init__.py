@@ -10,6 +10,7 @@ from rendering.scenes.large import large
 from rendering.scenes.metal import metal
 from rendering.scenes.pins import pins
 from rendering.scenes.texture import texture
+from rendering.scenes.tumbled import tumbled
 from rendering.scenes.wedges import wedges
 
 SCENES: Mapping[str, Callable[[], Scene]] = {
@@ -19,4 +20,5 @@ SCENES: Mapping[str, Callable[[], Scene]] = {
     "D_clutter": clutter,
     "E_wedges": wedges,
     "F_large": large,
+    "G_tumbled": tumbled,
 }

@@ -39,7 +39,7 @@ def clutter() -> Scene:
             "before each other, on a striped ground. Right camera rolled by 28 deg."
         ),
         views=_views(),
-        solids=_bodies(),
+        solids=bodies(43, COUNT),
         grounds=(ground(Finish(print_name="stripes")),),
         lights=(
             Light((-450, 400, 750), (350, 350), 7.0),
@@ -78,16 +78,23 @@ def _views() -> tuple[View, ...]:
     )
 
 
-def _bodies() -> tuple[Solid, ...]:
-    rng = np.random.default_rng(43)
+def bodies(seed: int, count: int) -> tuple[Solid, ...]:
+    """Return solids at random places and tilts, none in another.
+
+    Raises
+    ------
+    ValueError
+        If there is no room for so many.
+    """
+    rng = np.random.default_rng(seed)
     placed: list[Solid] = []
     for _ in range(TRIES):
-        if len(placed) == COUNT:
+        if len(placed) == count:
             return tuple(placed)
         body = _strewn(len(placed) + 1, rng)
         if all(apart(body, other, GAP_MM) for other in placed):
             placed.append(body)
-    raise ValueError(f"only {len(placed)} of {COUNT} solids found room; enlarge HALF_MM")
+    raise ValueError(f"only {len(placed)} of {count} solids found room; enlarge HALF_MM")
 
 
 def _strewn(number: int, rng: np.random.Generator) -> Solid:

@@ -54,7 +54,7 @@ plain scenes it is 0.7 to 1.3, on cluttered ones 1.5, of images that do not belo
 more."""
 
 FEWEST_MUTUAL = 40
-"""Such matches without which their median says nothing."""
+"""Matches that agree both ways without which a quantile of their costs says nothing."""
 
 STRAY = 3.0
 """Residual against the smoothed chain, in standard deviations, that is not chance."""

@@ -28,10 +28,6 @@ element only where two thirds of the points of that find nothing."""
 ELSEWHERE_PX = 1.5
 """Candidates further apart than this, along the epipolar curve, are different answers."""
 
-SQUARES_SHARE = 2 / 3
-"""Weight of squares, of a point with one candidate. A chain may run on behind what hides it in the
-other view, beside an edge that is seen there; what stands around the point does not agree then."""
-
 POWER = 2
 """Power of the margins that are the weights: of measurements whose signals differ and whose noise
 is alike, a mean weighted by the squared signals is the surest. Noise is nearly alike: most of it is
@@ -44,8 +40,9 @@ def support(first: EdgePoints, candidates: Candidates, table: DepthTable) -> Flo
     For every point each element has an answer, its best candidate, and a margin: by how much the
     best candidate elsewhere is worse. An element that is too small, or sees only what repeats,
     or sees other heights, has a small margin. Elements are weighted by the square of it. A point
-    with one candidate has no margins, and the question is whether it is there at all: squares have
-    more say in that (`SQUARES_SHARE`).
+    with one candidate has no margins, and the question is whether it is there at all. All elements
+    but the longest strip are asked alike: a chain may run on behind what hides it in the other
+    view, and most of it be seen.
 
     All elements are level, as the thesis' is. Where they fit badly the edge may be slanted: how far
     it runs beside the candidate's chain is the cost then.
@@ -64,15 +61,14 @@ def support(first: EdgePoints, candidates: Candidates, table: DepthTable) -> Flo
     weights = margins**POWER + 1e-6  # none has a margin: all the same
     level = np.einsum("em,em->m", costs, weights / weights.sum(axis=0))
     alone = (margins == MISFIT_LIMIT_PX).all(axis=0)
-    squares, strips = costs[: len(SQUARES), alone], costs[len(SQUARES) :, alone]
-    level[alone] = SQUARES_SHARE * squares.mean(axis=0) + (1 - SQUARES_SHARE) * strips.mean(axis=0)
+    level[alone] = costs[:-1, alone].mean(axis=0)
     reach = round(max(STRIPS) * first.size_px[0])
     slanted = slanted_misfit(first, candidates, table.line, table.axis, reach)
     return np.asarray(np.minimum(level, slanted + SLANT_PRICE))
 
 
 def _elements(first: EdgePoints, table: DepthTable) -> list[Element]:
-    """Return squares and strips, the squares first."""
+    """Return squares and strips, the longest strip last."""
     width = first.size_px[0]
     squares = [Square.of(table.line, first.xy_px, share * width) for share in SQUARES]
     strips = [Strip.of(table.line, round(share * width)) for share in STRIPS]

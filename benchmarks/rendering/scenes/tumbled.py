@@ -1,0 +1,60 @@
+"""Other tumbled solids than those of the clutter, on a plain ground, for other cameras."""
+
+from __future__ import annotations
+
+from rendering.cameras import View, looking
+from rendering.placing import Place, around
+from rendering.scene import Light, Scene, ground
+from rendering.scenes.clutter import bodies
+from rendering.solids import Finish
+
+TARGET: Place = (0.0, 0.0, -36.0)
+SIZE_PX = (768, 600)
+COUNT = 14
+
+
+def tumbled() -> Scene:
+    """Return tilted solids on a plain ground; made after the matcher's constants were fixed."""
+    return Scene(
+        name="G_tumbled",
+        text=(
+            f"{COUNT} different small solids at random tilts, cut off by the work plane, on a "
+            "plain ground. Left camera rolled by -12 deg, right by 9 deg."
+        ),
+        views=_views(),
+        solids=bodies(143, COUNT),
+        grounds=(ground(Finish(0.16)),),
+        lights=(
+            Light((500, 350, 750), (350, 350), 8.0),
+            Light((-450, -400, 850), (300, 300), 5.0),
+        ),
+        heights_mm=(-53, 0),
+        seed=141,
+        gains=(0.9, 1.0),
+        bright=0.85,
+    )
+
+
+def _views() -> tuple[View, ...]:
+    return (
+        looking(
+            "left",
+            SIZE_PX,
+            3300.0,
+            centre_mm=around(820, -9, -6, TARGET),
+            target_mm=(-1, 1, -36),
+            roll_deg=-12,
+            off_px=(-6.1, 3.7),
+            brown=(-0.4, 0.7, 0.0007, -0.0011, 0.0),
+        ),
+        looking(
+            "right",
+            SIZE_PX,
+            3050.0,
+            centre_mm=around(760, 13, 4, TARGET),
+            target_mm=(1, 2, -36),
+            roll_deg=9,
+            off_px=(8.8, -7.4),
+            brown=(-0.45, 0.9, -0.0008, 0.0006, 0.0),
+        ),
+    )
