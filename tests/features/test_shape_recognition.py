@@ -314,3 +314,11 @@ def test_the_parts_of_the_rendered_scene(shared):
     hits = find_shapes(image, shapes)
     assert [hit.shape for hit in hits] == [*places, "clip", "block"]
     assert find_shapes(read(shared, "A_blocks/left.png"), shapes) == []
+
+
+@pytest.mark.parametrize("margin_px", [float("nan"), -1.0, 500.0])
+def test_a_margin_that_is_none_is_refused_as_such(margin_px):
+    image = np.zeros((60, 60), np.uint8)
+    image[20:40, 20:40] = 200
+    with pytest.raises(InputError, match="possible are 0 to 64 px"):
+        teach_shape(image, name="square", at_px=(30, 30), margin_px=margin_px)

@@ -541,3 +541,16 @@ def test_progress_is_told():
         progress=lambda done, all_: told.append((done, all_)),
     )
     assert told == [(1, 3), (2, 3), (3, 3)]
+
+
+@pytest.mark.parametrize("side_px", [10**20 + 1, 999_999])
+def test_an_element_larger_than_the_image_is_refused_before_it_is_made(box_scene, side_px):
+    images = list(box_scene.images.values())
+    with pytest.raises(InputError, match="in an image of 256 px"):
+        match_literal(
+            images,
+            box_scene.rig.cameras,
+            [[100.0, 100.0]],
+            box_scene.rig.volume_mm,
+            side_px=side_px,
+        )

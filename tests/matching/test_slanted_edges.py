@@ -10,7 +10,7 @@ import pytest
 from closerange.features.edges import EdgePoints
 from closerange.matching.candidates import Candidates
 from closerange.matching.depth_table import MISFIT_LIMIT_PX, Line
-from closerange.matching.slanted_edges import GAP, LEVEL_PX, SAME_RUN_PLACES, runs, slanted_misfit
+from closerange.matching.slanted_edges import GAP, LEVEL_PX, NEIGHBOUR_PLACES, runs, slanted_misfit
 
 WIDTHS = {"xy_px": 2, "xyz_mm": 3, "tangent": 2, "epipolar": 2, "upright_first": 2}
 
@@ -71,7 +71,7 @@ def test_runs_are_those_of_walks_made_one_by_one():
                 (candidates.point == following) & (candidates.chain == candidates.chain[row])
             )
             away = np.abs(candidates.place[there] - candidates.place[row] - step)
-            if following >= 0 and there.size and away.min() <= SAME_RUN_PLACES * step:
+            if following >= 0 and there.size and away.min() <= NEIGHBOUR_PLACES * step:
                 parent[root(row)] = root(there[np.argmin(away)])
                 break
     wanted = np.array([root(row) for row in range(300)])

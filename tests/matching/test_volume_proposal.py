@@ -3,7 +3,7 @@ import json
 import numpy as np
 import pytest
 
-from closerange.errors import GeometryError
+from closerange.errors import GeometryError, InputError
 from closerange.geometry.transform import RigidTransform
 from closerange.matching.common_view import (
     check_in_view,
@@ -179,3 +179,9 @@ def test_a_proposal_keeps_within_limits(setups):
     with pytest.raises(GeometryError, match="no place within the limits") as error:
         propose_volume(cameras, within_mm=between_planes(far, far + 1))
     assert "widen the limits" in error.value.remedy
+
+
+def test_limits_without_room_between_them_are_refused(box_scene):
+    flat = [[-50, -50, 5], [50, 50, 5]]
+    with pytest.raises(InputError, match="Z = 5 mm"):
+        propose_volume(box_scene.rig.cameras, within_mm=flat)

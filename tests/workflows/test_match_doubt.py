@@ -126,3 +126,22 @@ def test_a_part_that_fits_both_ways_is_told_and_kept(box_scene):
             matched = found(rig, left, right)
         assert matched.doubt == ""
         assert matched.matches.clean.sum() > 50
+
+
+@pytest.mark.parametrize("kind", ["black", "another scene"])
+def test_a_third_view_that_shows_nothing_of_the_part_is_named_and_loosens_nothing(box_scene, kind):
+    third = looking_at_origin(
+        "third", angle_rad=0.9, distance_mm=800.0, focal_px=1900.0, size_px=(320, 256)
+    )
+    rig = SyntheticRig(
+        "three", (*box_scene.rig.cameras, third), box_scene.rig.volume_mm, 0.05
+    ).true_rig()
+    useless = np.full((256, 320), 20, np.uint8)
+    if kind == "another scene":
+        cv2.rectangle(useless, (60, 40), (250, 200), 180, 5)
+    images = {name: cr.Frame(name, pixels) for name, pixels in box_scene.images.items()}
+    alone = cr.match(rig, images)
+    with pytest.warns(CloseRangeWarning, match="in camera 'third'"):
+        both = cr.match(rig, {**images, "third": cr.Frame("third", noisy(useless))})
+    kept = [found.found[:, 1] & (found.flags[:, 1] == 0) for found in (alone, both)]
+    assert (kept[1] & ~kept[0]).sum() <= 0.01 * kept[0].sum()

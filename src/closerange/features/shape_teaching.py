@@ -13,6 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 from closerange.errors import CloseRangeWarning, DetectionError, InputError
 from closerange.features.shapes import (
     MARGIN_PX,
+    MAX_MARGIN_PX,
     POLARITIES,
     RING_PX,
     Polarity,
@@ -82,6 +83,11 @@ def teach_shape(
         raise InputError(
             f"an image of {pixels.dtype} and shape {pixels.shape} cannot teach a shape",
             remedy="give a two-dimensional image of uint8 or uint16",
+        )
+    if not 0.0 <= margin_px <= MAX_MARGIN_PX:
+        raise InputError(
+            f"shape {name!r}: a margin of {margin_px:g} px; possible are 0 to {MAX_MARGIN_PX:g} px",
+            remedy="leave it out: 2 px suit a sharp image",
         )
     if (at_px is None) == (mask is None):
         raise InputError("a shape is taught by a place or by a mask", remedy="give one of them")

@@ -27,6 +27,9 @@ blurred border fills; more would ask for emptier surroundings without telling mo
 MAX_SIDE_PX = 2048
 """Longest side of a taught shape."""
 
+MAX_MARGIN_PX = 64.0
+"""Widest half-width of the band: more would leave nothing of most shapes."""
+
 MAX_ROLLS = 720
 """Most elements in the stack of one shape: steps of half a degree."""
 
@@ -107,7 +110,7 @@ class Shape:
         limits = {
             "contrast": (self.contrast, 0.0, 65535.0),
             "sharpness": (self.sharpness, 0.0, 10.0),
-            "margin_px": (self.margin_px, 0.0, 64.0),
+            "margin_px": (self.margin_px, 0.0, MAX_MARGIN_PX),
             "ring_px": (self.ring_px, 1.0, 64.0),
         }
         if self.rotation_step_deg is not None:

@@ -19,7 +19,7 @@ from closerange.matching.continuity import NO_MATCH, Choice, choose
 from closerange.matching.depth_table import MISFIT_LIMIT_PX
 from closerange.matching.edge_covariance import SmoothedMatches, smooth_matches
 from closerange.matching.element_weights import best_rows
-from closerange.matching.evidence import OTHER_PX, unary_cost
+from closerange.matching.evidence import reward, unary_cost
 from closerange.matching.pencil import Pencil
 from closerange.matching.repeats import hidden_repeats
 from closerange.rig.camera import Camera
@@ -140,7 +140,7 @@ def match_edges(
     most = max(len(edge) for edge in edges)
     with ThreadPoolExecutor(1 if most > ONE_BY_ONE else 2) as pool:
         found = list(pool.map(lambda way: _evidence(way, volume_mm, others), ways))
-        no_match = _cost_of_none(edges[1], found, axis, len(others))
+        no_match = _cost_of_none(edges[1], found, axis)
         forward, backward = pool.map(
             lambda way, evidence: _chosen(way[1][0], evidence, axis, no_match), ways, found
         )
@@ -153,10 +153,11 @@ def match_edges(
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Evidence:
-    """Candidates of one direction and what each costs."""
+    """Candidates of one direction, what each costs, and what it costs by two views alone."""
 
     candidates: Candidates
     cost: FloatArray
+    by_two: FloatArray
 
 
 def _evidence(
@@ -166,10 +167,11 @@ def _evidence(
 ) -> _Evidence:
     pencil, edges, greys = way
     candidates = find_candidates(pencil, *edges, volume_mm)
-    return _Evidence(candidates, unary_cost(edges[0], candidates, greys, pencil, others))
+    cost = unary_cost(edges[0], candidates, greys, pencil)
+    return _Evidence(candidates, cost - reward(candidates, others), cost)
 
 
-def _cost_of_none(second: EdgePoints, found: Sequence[_Evidence], axis: int, others: int) -> float:
+def _cost_of_none(second: EdgePoints, found: Sequence[_Evidence], axis: int) -> float:
     """Return what having no match shall cost: more than what a right one costs in these images.
 
     On slanted and cluttered parts right matches cost more than on level ones. Which are right is
@@ -185,11 +187,11 @@ def _cost_of_none(second: EdgePoints, found: Sequence[_Evidence], axis: int, oth
     mutual = _returning(there.candidates.select(best), height, second, axis)
     if mutual.sum() < FEWEST_MUTUAL:
         return NO_MATCH
-    usual = float(np.quantile(there.cost[best[mutual]], USUAL))
+    # by two views alone: a further one may show nothing of the part
+    usual = float(np.quantile(there.by_two[best[mutual]], USUAL))
     if usual > UNRELATED_PX:
         return NO_MATCH
-    # a right match may be hidden from all further views, which most are not
-    return min(usual + MORE_PX, MISFIT_LIMIT_PX) + others * OTHER_PX
+    return min(usual + MORE_PX, MISFIT_LIMIT_PX)
 
 
 def _chosen(first: EdgePoints, evidence: _Evidence, axis: int, no_match: float) -> _Side:

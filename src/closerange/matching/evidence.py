@@ -59,9 +59,6 @@ OTHER_WEIGHT = 0.5
 HIDDEN_PX = 2.0
 """Misfit in a further view where nothing is near."""
 
-OTHER_PX = OTHER_WEIGHT * HIDDEN_PX
-"""Most that a further view takes off the cost of a candidate."""
-
 GOOD_PX = 1.0
 """Cost of candidates from which the brightness of the two views is compared: misfit of a pixel."""
 
@@ -89,7 +86,6 @@ def unary_cost(
     candidates: Candidates,
     greys: tuple[NDArray[Any], NDArray[Any]],
     pencil: Pencil,
-    others: Sequence[tuple[Camera, EdgePoints]] = (),
 ) -> FloatArray:
     """Return the cost of each candidate, in pixels of misfit, shape (M,).
 
@@ -108,8 +104,6 @@ def unary_cost(
         Grey values of both images, float32; gain and offset between them may be anything.
     pencil : Pencil
         Of the two cameras.
-    others : sequence of (Camera, EdgePoints), optional
-        Further views: a candidate's world point should lie on an edge there too.
 
     Returns
     -------
@@ -119,10 +113,25 @@ def unary_cost(
     if not len(candidates):
         return np.zeros(0)
     cost = _misfit(first, candidates, pencil)
-    for camera, edges in others:
-        # a reward, not a price: what a further view does not show may be hidden there
-        cost += OTHER_WEIGHT * (_other_view(camera, edges, candidates) - HIDDEN_PX)
     return np.asarray(cost + side_cost(first, candidates, greys, cost))
+
+
+def reward(candidates: Candidates, others: Sequence[tuple[Camera, EdgePoints]]) -> FloatArray:
+    """Return what further views take off the cost of each candidate, px of misfit, shape (M,).
+
+    A reward, not a price: what a further view does not show may be hidden there.
+
+    Parameters
+    ----------
+    candidates : Candidates
+        M rows.
+    others : sequence of (Camera, EdgePoints)
+        Further views: a candidate's world point should lie on an edge there too.
+    """
+    earned = np.zeros(len(candidates))
+    for camera, edges in others if len(candidates) else ():
+        earned += OTHER_WEIGHT * (HIDDEN_PX - _other_view(camera, edges, candidates))
+    return earned
 
 
 def _misfit(first: EdgePoints, candidates: Candidates, pencil: Pencil) -> FloatArray:

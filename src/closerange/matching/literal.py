@@ -385,9 +385,10 @@ def match_literal(
         If an image has another size than its camera, or the element, the band or the volume is
         none.
     """
-    inside = footprint(side_px)
     for camera, image in zip(cameras, images, strict=True):
         _check_size(camera, image)
+    check_side(side_px, largest_px=min(cameras[0].size_px))
+    inside = footprint(side_px)
     masks = binary_images(images, original=original)
     matcher = LiteralMatcher(cameras, masks, volume_mm, band_px=band_px)
     return matcher.match(xy_px, inside, whole_image=whole_image)

@@ -86,8 +86,13 @@ def strip_footprint(side_px: int, tangent: tuple[float, float]) -> BoolArray:
     return np.asarray(inside)
 
 
-def check_side(side_px: int) -> None:
-    """Refuse elements without a centre pixel or without surroundings."""
+def check_side(side_px: int, *, largest_px: int | None = None) -> None:
+    """Refuse elements without a centre pixel, without surroundings, or larger than an image."""
+    if largest_px is not None and side_px > largest_px:
+        raise InputError(
+            f"an element of {side_px} x {side_px} px in an image of {largest_px} px",
+            remedy="choose a smaller one: 15 px for edge points, 59 px for centroids",
+        )
     if side_px != int(side_px) or side_px < 3 or side_px % 2 == 0:
         raise InputError(
             f"an element of {side_px} x {side_px} px",

@@ -15,11 +15,8 @@ from scipy.sparse.csgraph import connected_components
 from closerange.features.edges import EdgePoints
 from closerange.geometry.arrays import FloatArray, IntArray
 from closerange.matching.candidates import Candidates
+from closerange.matching.continuity import NEIGHBOUR_PLACES
 from closerange.matching.depth_table import MISFIT_LIMIT_PX, Line
-
-SAME_RUN_PLACES = 4.0
-"""Places on a chain of the second view between matches of neighbours: an edge may be seen there up
-to four times as long."""
 
 GAP = 2
 """Steps along a chain after which a run may go on: one point may lack its candidate."""
@@ -81,7 +78,7 @@ def runs(after: IntArray, candidates: Candidates) -> IntArray:
     chains = int(candidates.chain.max()) + 1
     # candidates of one point on one chain stand together, by place
     owners, owner = np.unique(candidates.point * chains + candidates.chain, return_inverse=True)
-    span = float(candidates.place.max()) + 2 * GAP * SAME_RUN_PLACES + 1.0
+    span = float(candidates.place.max()) + 2 * GAP * NEIGHBOUR_PLACES + 1.0
     key = owner * span + candidates.place
     order = np.argsort(key, kind="stable")
     keys = key[order]
@@ -96,7 +93,7 @@ def runs(after: IntArray, candidates: Candidates) -> IntArray:
         left = np.maximum(right - 1, 0)
         near = np.where(np.abs(keys[left] - place) <= np.abs(keys[right] - place), left, right)
         found = alone & (following >= 0) & (owners[group] == wanted)
-        found &= np.abs(keys[near] - place) <= SAME_RUN_PLACES * step
+        found &= np.abs(keys[near] - place) <= NEIGHBOUR_PLACES * step
         links.append(np.stack([np.flatnonzero(found), order[near[found]]]))
         alone &= ~found
     start, stop = np.concatenate(links, axis=1)

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike
 
-from closerange.errors import GeometryError
+from closerange.errors import GeometryError, InputError
 from closerange.flags import Flag
 from closerange.geometry.arrays import FloatArray
 from closerange.matching.box_search import Slices, best_box
@@ -107,7 +107,7 @@ def propose_volume(
     would lie as far away as the cameras see, where they see least.
     """
     cameras, count = checked_cameras(rig, least, margin_px)
-    limits = None if within_mm is None else checked_volume(within_mm)
+    limits = None if within_mm is None else _with_depth(checked_volume(within_mm))
     sought = _Sought(cameras, count, margin_px, limits)
     box, cell_mm = _best_start(sought)
     for _ in range(_SHRINKS):
@@ -237,6 +237,16 @@ def _box_of(grid: ViewGrid, slices: Slices) -> FloatArray:
         air = 0.25 * cell if piece.stop - piece.start == 1 else 0.0
         rows.append((axis[piece.start] - air, axis[piece.stop - 1] + air))
     return np.array(rows).T
+
+
+def _with_depth(limits_mm: FloatArray) -> FloatArray:
+    """Refuse limits between which there is no room for a volume."""
+    for axis in np.flatnonzero(limits_mm[0] == limits_mm[1]):
+        raise InputError(
+            f"the volume may only have {'XYZ'[axis]} = {limits_mm[0, axis]:g} mm",
+            remedy="give two different limits",
+        )
+    return limits_mm
 
 
 def _rounded_inwards(box_mm: FloatArray) -> FloatArray:

@@ -40,8 +40,9 @@ is nearly symmetric 1.4, and 1 for a flat part, which looks the same in both ord
 MAX_CAMERAS = 4
 """Cameras up to which all orders of images are tried; in a larger rig only among those named."""
 
-NEARLY_NOTHING = 0.05
-"""Share of points matched without a flag below which one is warned: chance gives as much."""
+NEARLY_NOTHING = 0.15
+"""Share of points matched without a flag below which one is warned: of two images that have nothing
+in common a tenth may match by chance."""
 
 ENOUGH = 20
 """Points without which a share means nothing."""
@@ -127,12 +128,16 @@ def find_doubt(
 
 
 def few_match(found: Correspondences) -> str | None:
-    """Say so if nearly nothing matches; None where enough does, or too little was asked."""
+    """Say so if nearly nothing matches in a view; None where enough does, or little was asked."""
     located = int(found.found[:, 0].sum())
-    clean = int(found.clean.sum())
+    kept = found.found & (found.flags == 0) & (found.flags[:, :1] == 0)
+    poorest = 1 + int(kept[:, 1:].sum(axis=0).argmin())
+    clean = int(kept[:, poorest].sum())
     if located < ENOUGH or clean > NEARLY_NOTHING * located:
         return None
     what = f"{clean} of {located} points match without a flag"
+    if len(found.cameras) > 2:
+        what += f" in camera {found.cameras[poorest]!r}"
     if (flag := evident_flag(found)) is not None:
         return f"{what}; most are flagged {flag.name}: {EVIDENT[flag]}"
     return (

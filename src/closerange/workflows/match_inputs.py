@@ -258,7 +258,8 @@ def volume_of(
     if z_mm is not None:
         return between_planes(*z_mm), "stated"
     if volume_mm is not None:
-        return checked_volume(np.reshape(np.asarray(volume_mm, np.float64), (2, 3))), "stated"
+        corners = np.asarray(volume_mm, np.float64)
+        return checked_volume(corners.reshape(2, 3) if corners.size == 6 else corners), "stated"
     if (rig.volume_mm[0] < rig.volume_mm[1]).all():
         return rig.volume_mm, "rig"
     return propose_volume([rig.camera(name) for name in cameras], least=2), "proposed"

@@ -9,6 +9,7 @@ import numpy as np
 
 from closerange.delivery.ply import write_ply
 from closerange.delivery.wire import neighbours
+from closerange.flags import Flag
 from closerange.matching.correspondences import Correspondences
 from closerange.position.measure import measure_points
 from closerange.rig.rig import Rig
@@ -47,7 +48,8 @@ def write_wire_frame(rig: Rig, matches: Correspondences, path: Path | str) -> Dr
         write_ply(path, np.empty((0, 3)), std_mm=[], lines=[], colour_by=[])
         return Drawn(0, 0)
     positions = measure_points(rig, clean.to_image_points())
-    usable = positions.measured & (positions.flags == 0)
+    # whoever asked for points outside of the calibrated volume wants to see them
+    usable = positions.measured & (positions.flags & ~int(Flag.outside_volume) == 0)
     xyz_mm = positions.xyz_mm[usable]
     point = [name for name, use in zip(positions.point, usable, strict=True) if use]
     lines = neighbours(point, xyz_mm)
