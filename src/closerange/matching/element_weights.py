@@ -25,6 +25,10 @@ SLANT_PRICE = MISFIT_LIMIT_PX * 2 / 3
 """Cost in px of the less usual hypothesis that an edge is slanted: it is preferred to a level
 element only where two thirds of the points of that find nothing."""
 
+SQUARES_SHARE = 2 / 3
+"""Weight of squares, of a point with one candidate. A chain may run on behind what hides it in the
+other view, beside an edge that is seen there; what stands around the point does not agree then."""
+
 ELSEWHERE_PX = 1.5
 """Candidates further apart than this, along the epipolar curve, are different answers."""
 
@@ -40,9 +44,8 @@ def support(first: EdgePoints, candidates: Candidates, table: DepthTable) -> Flo
     For every point each element has an answer, its best candidate, and a margin: by how much the
     best candidate elsewhere is worse. An element that is too small, or sees only what repeats,
     or sees other heights, has a small margin. Elements are weighted by the square of it. A point
-    with one candidate has no margins, and the question is whether it is there at all. All elements
-    but the longest strip are asked alike: a chain may run on behind what hides it in the other
-    view, and most of it be seen.
+    with one candidate has no margins, and the question is whether it is there at all: see
+    `_doubtful`.
 
     All elements are level, as the thesis' is. Where they fit badly the edge may be slanted: how far
     it runs beside the candidate's chain is the cost then.
@@ -61,10 +64,21 @@ def support(first: EdgePoints, candidates: Candidates, table: DepthTable) -> Flo
     weights = margins**POWER + 1e-6  # none has a margin: all the same
     level = np.einsum("em,em->m", costs, weights / weights.sum(axis=0))
     alone = (margins == MISFIT_LIMIT_PX).all(axis=0)
-    level[alone] = costs[:-1, alone].mean(axis=0)
+    level[alone] = _doubtful(costs[:, alone])
     reach = round(max(STRIPS) * first.size_px[0])
     slanted = slanted_misfit(first, candidates, table.line, table.axis, reach)
     return np.asarray(np.minimum(level, slanted + SLANT_PRICE))
+
+
+def _doubtful(costs: FloatArray) -> FloatArray:
+    """Return the cost of only candidates, given that of each element: the worse of two verdicts.
+
+    One gives squares more say. The other leaves out the longest strip: a chain that is hidden here
+    may be seen for the most part.
+    """
+    squares, strips = costs[: len(SQUARES)], costs[len(SQUARES) :]
+    around = SQUARES_SHARE * squares.mean(axis=0) + (1 - SQUARES_SHARE) * strips.mean(axis=0)
+    return np.asarray(np.maximum(around, costs[:-1].mean(axis=0)))
 
 
 def _elements(first: EdgePoints, table: DepthTable) -> list[Element]:
