@@ -10,7 +10,7 @@ from rendering.scenes.large import large
 from rendering.scenes.metal import metal
 from rendering.scenes.pins import pins
 from rendering.scenes.texture import texture
-from rendering.scenes.tumbled import tumbled
+from rendering.scenes.tumbled import tumbled, tumbled_again
 from rendering.scenes.wedges import wedges
 
 SCENES: Mapping[str, Callable[[], Scene]] = {
@@ -21,4 +21,5 @@ SCENES: Mapping[str, Callable[[], Scene]] = {
     "E_wedges": wedges,
     "F_large": large,
     "G_tumbled": tumbled,
+    "H_tumbled": tumbled_again,
 }

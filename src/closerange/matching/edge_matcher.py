@@ -147,8 +147,7 @@ def match_edges(
     smooth = smooth_matches(pencil, edges, forward.candidates, forward.choice, axis)
     matches = _judged(pencil, edges, (forward, backward), smooth, volume_mm)
     unsure = _repeated(pencil, edges, greys, (forward, backward), matches.flags == 0, volume_mm)
-    matches.flags[unsure] |= int(Flag.ambiguous)
-    return matches
+    return replace(matches, flags=matches.flags | np.where(unsure, int(Flag.ambiguous), 0))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
