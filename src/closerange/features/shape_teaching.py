@@ -79,16 +79,7 @@ def teach_shape(
         If its faintest border is weak, or a roll between two steps moves the shape's rim by
         more than the margin.
     """
-    if pixels.ndim != 2 or pixels.dtype not in (np.uint8, np.uint16):
-        raise InputError(
-            f"an image of {pixels.dtype} and shape {pixels.shape} cannot teach a shape",
-            remedy="give a two-dimensional image of uint8 or uint16",
-        )
-    if not 0.0 <= margin_px <= MAX_MARGIN_PX:
-        raise InputError(
-            f"shape {name!r}: a margin of {margin_px:g} px; possible are 0 to {MAX_MARGIN_PX:g} px",
-            remedy="leave it out: 2 px suit a sharp image",
-        )
+    _check_lesson(name, pixels, margin_px)
     if (at_px is None) == (mask is None):
         raise InputError("a shape is taught by a place or by a mask", remedy="give one of them")
     grey = without_specks(pixels).astype(np.float32)
@@ -121,6 +112,20 @@ def teach_shape(
     )
     _warn_of_weakness(shape)
     return shape
+
+
+def _check_lesson(name: str, pixels: NDArray[Any], margin_px: float) -> None:
+    """Refuse an image or a margin that no shape can be taught with."""
+    if pixels.ndim != 2 or pixels.dtype not in (np.uint8, np.uint16):
+        raise InputError(
+            f"an image of {pixels.dtype} and shape {pixels.shape} cannot teach a shape",
+            remedy="give a two-dimensional image of uint8 or uint16",
+        )
+    if not 0.0 <= margin_px <= MAX_MARGIN_PX:
+        raise InputError(
+            f"shape {name!r}: a margin of {margin_px:g} px; possible are 0 to {MAX_MARGIN_PX:g} px",
+            remedy="leave it out: 2 px suit a sharp image",
+        )
 
 
 def _seed(at_px: tuple[float, float] | None, size: tuple[int, ...]) -> tuple[int, int]:

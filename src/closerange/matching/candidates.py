@@ -174,25 +174,55 @@ def _crossings(
     lowest, highest = slopes_within(pencil, theta, slope, volume_mm)
     theta_2, slope_2 = pencil.coordinates(pencil.second, second.xy_px)
     rise = np.sign(np.where(lowest <= highest, rise_along(theta, first), 0.0))
-    link = np.flatnonzero(second.after >= 0)
-    climb = theta_2[second.after[link]] - theta_2[link]
-    found = [(np.zeros(0, np.int64), np.zeros(0, np.int64), np.zeros(0), np.zeros(0))]
+    none = np.zeros(0, np.int64)
+    found: list[tuple[IntArray, IntArray, FloatArray, FloatArray]] = [
+        (none, none, np.zeros(0), np.zeros(0))
+    ]
+    for point, piece, share, met in crossed_chains((theta, rise), second, (theta_2, slope_2)):
+        rows = np.flatnonzero((met >= lowest[point]) & (met <= highest[point]))
+        found.append((point[rows], piece[rows], share[rows], met[rows]))
+    point, piece, share, met = (np.concatenate(column) for column in zip(*found, strict=True))
+    order = np.lexsort((met, point))
+    return point[order], piece[order], share[order], met[order]
+
+
+def crossed_chains(
+    curves: tuple[FloatArray, FloatArray],
+    edges: EdgePoints,
+    coordinates: tuple[FloatArray, FloatArray],
+) -> Iterator[tuple[IntArray, IntArray, FloatArray, FloatArray]]:
+    """Yield where epipolar curves meet pieces of chains that rise as they do, some at a time.
+
+    Parameters
+    ----------
+    curves : tuple of two ndarrays, shape (N,)
+        Theta of each curve, and the sign with which theta shall change along a chain; with 0 the
+        curve meets nothing.
+    edges : EdgePoints
+        The chains.
+    coordinates : tuple of two ndarrays
+        Theta and slope of their points.
+
+    Yields
+    ------
+    curve, piece : ndarray of int, shape (M,)
+        Which curve, and the point at which the crossed piece begins.
+    share, met : ndarray, shape (M,)
+        Place between that point (0) and the next (1), and slope there.
+    """
+    (theta, rise), (along, slope) = curves, coordinates
+    link = np.flatnonzero(edges.after >= 0)
+    climb = along[edges.after[link]] - along[link]
     for sign in (1, -1):
         points = np.flatnonzero(rise == sign)
         points = points[np.argsort(theta[points], kind="stable")]
         pieces = link[np.sign(climb) == sign]
-        after = second.after[pieces]
-        start, step = theta_2[pieces], theta_2[after] - theta_2[pieces]
-        ends = (start, theta_2[after])[::sign]
-        for nearby, crossed in straddled(theta[points], *ends):
-            point, piece = points[nearby], pieces[crossed]
-            share = (theta[point] - start[crossed]) / step[crossed]
-            met = slope_2[piece] + share * (slope_2[after[crossed]] - slope_2[piece])
-            rows = np.flatnonzero((met >= lowest[point]) & (met <= highest[point]))
-            found.append((point[rows], piece[rows], share[rows], met[rows]))
-    point, piece, share, met = (np.concatenate(column) for column in zip(*found, strict=True))
-    order = np.lexsort((met, point))
-    return point[order], piece[order], share[order], met[order]
+        after = edges.after[pieces]
+        ends = (along[pieces], along[after])[::sign]
+        for nearby, crossed in _straddled(theta[points], *ends):
+            point, piece, end = points[nearby], pieces[crossed], after[crossed]
+            share = (theta[point] - along[piece]) / (along[end] - along[piece])
+            yield point, piece, share, slope[piece] + share * (slope[end] - slope[piece])
 
 
 def slopes_within(
@@ -215,7 +245,7 @@ def slopes_within(
         return lowest, slope - pencil.baseline_mm * (1 - SLACK) / furthest
 
 
-def straddled(
+def _straddled(
     ordered: FloatArray, low: FloatArray, high: FloatArray
 ) -> Iterator[tuple[IntArray, IntArray]]:
     """Yield all pairs (i, j) with low[j] <= ordered[i] < high[j], some at a time."""

@@ -213,14 +213,15 @@ def _pair(
     on_texture = on_texture[wanted]
     beside = np.flatnonzero(~near & all_finite(seeds, 1) & inside_image(first.camera, seeds))
     none = np.zeros(0, dtype=np.int64)
-    if textured:
-        edges = (first.edges.select(none), second.edges.select(none))
+    no_edges = (first.edges.select(none), second.edges.select(none))
     if beside.size:
-        windows = match_windows(pencil, greys, edges, seeds[beside], volume_mm, others=further)
+        around = no_edges if textured else edges
+        windows = match_windows(pencil, greys, around, seeds[beside], volume_mm, others=further)
         _put(found, beside, _by_windows(windows))
     if on_texture.size:
-        edges = (first.edges.select(none), second.edges.select(none))
-        windows = match_windows(pencil, greys, edges, seeds[on_texture], volume_mm, others=further)
+        windows = match_windows(
+            pencil, greys, no_edges, seeds[on_texture], volume_mm, others=further
+        )
         part = _by_windows(windows)
         better = believes_window(
             lines[edge[on_texture]],

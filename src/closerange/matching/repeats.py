@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from closerange.features.edge_chains import chain_places
 from closerange.features.edges import EdgePoints
 from closerange.geometry.arrays import BoolArray, FloatArray, IntArray
-from closerange.matching.candidates import Candidates, rise_along, slopes_within, straddled
+from closerange.matching.candidates import Candidates, crossed_chains, rise_along, slopes_within
 from closerange.matching.evidence import SIDE_STEP_PX, grey_beside
 from closerange.matching.pencil import Pencil
 from closerange.rig.camera import Camera
@@ -91,22 +91,11 @@ class _View:
     def neighbours(self, places: _Places) -> _Neighbours:
         """Return the edges of the same direction on both sides of places, along their curves."""
         found = [(np.zeros(0, np.int64), np.zeros(0, np.int64), np.zeros(0))]
-        link = np.flatnonzero(self.edges.after >= 0)
-        climb = self.theta[self.edges.after[link]] - self.theta[link]
-        for sign in (1, -1):
-            points = np.flatnonzero(places.rise == sign)
-            points = points[np.argsort(places.theta[points], kind="stable")]
-            pieces = link[np.sign(climb) == sign]
-            after = self.edges.after[pieces]
-            ends = (self.theta[pieces], self.theta[after])[::sign]
-            for nearby, crossed in straddled(places.theta[points], *ends):
-                point, piece, end = points[nearby], pieces[crossed], after[crossed]
-                start = self.theta[piece]
-                share = (places.theta[point] - start) / (self.theta[end] - start)
-                met = self.slope[piece] + share * (self.slope[end] - self.slope[piece])
-                offset = met - places.slope[point]
-                rows = np.flatnonzero(np.abs(offset) <= places.reach[point])
-                found.append((point[rows], piece[rows], offset[rows]))
+        curves, coordinates = (places.theta, places.rise), (self.theta, self.slope)
+        for point, piece, _, met in crossed_chains(curves, self.edges, coordinates):
+            offset = met - places.slope[point]
+            rows = np.flatnonzero(np.abs(offset) <= places.reach[point])
+            found.append((point[rows], piece[rows], offset[rows]))
         place, piece, offset = (np.concatenate(column) for column in zip(*found, strict=True))
         return self._alike(places, place, piece, offset)
 
